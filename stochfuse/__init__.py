@@ -1,0 +1,56 @@
+"""stochfuse: how good a fused estimate will be, as a function of the link probability.
+
+    >>> import stochfuse as sf
+    >>> s = sf.load_scenario("thesis-transient")
+    >>> p = sf.predict(s, link=[0, 0.25, 0.5])
+    >>> p.covariance.shape                     # link, step, state, state
+    (3, 5, 1, 1)
+
+Names are loaded when first used, so that the command line starts without what it does not need.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from stochfuse.errors import NoAnswerError as NoAnswerError
+    from stochfuse.errors import ScenarioError as ScenarioError
+    from stochfuse.errors import StochfuseError as StochfuseError
+    from stochfuse.errors import UsageError as UsageError
+    from stochfuse.methods import predict as predict
+    from stochfuse.questions import steady_state as steady_state
+    from stochfuse.prediction import Prediction as Prediction
+    from stochfuse.scenario import Scenario as Scenario
+    from stochfuse.scenario import load_scenario as load_scenario
+    from stochfuse.states import predict_states as predict_states
+    from stochfuse.symbolic import derive_simplified as derive_simplified
+
+_HOME = {
+    "NoAnswerError": "errors",
+    "Prediction": "prediction",
+    "Scenario": "scenario",
+    "ScenarioError": "errors",
+    "StochfuseError": "errors",
+    "UsageError": "errors",
+    "derive_simplified": "symbolic",
+    "load_scenario": "scenario",
+    "predict": "methods",
+    "predict_states": "states",
+    "steady_state": "questions",
+}
+
+__all__ = ["__version__", *sorted(_HOME)]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'stochfuse' has no attribute '{name}'")
+    return getattr(import_module(f"stochfuse.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,181 @@
+"""How many messages arrive, and the two averages over that number that (54) needs.
+
+If m of N possible messages arrive, (54) leaves of a direction with signal-to-noise ratio s the share
+1/(1 + (m+1)s) of its prior variance.  Averaged over the distribution β of m,
+
+    E(s) = Σ β(m) / (1 + (m+1)s)            what remains of the variance
+    g(s) = Σ β(m) (m+1) / (1 + (m+1)s)      what is gained, per unit of s:   E = 1 − s g
+
+Up to a hundred senders the sums are evaluated as they stand.  For more like senders they are integrals over t from
+0 to ∞, with φ(t) = 1 − µ + µe^(−ts) the generating function of one message,
+
+    E = ∫ e^(−t(1+s)) φ(t)^N dt             g = ∫ e^(−t(1+s)) φ(t)^N (1 + Nµ e^(−ts)/φ(t)) dt
+
+and a fixed double-exponential rule gives them to rounding, at a cost that does not depend on N, without a binomial
+coefficient that could overflow and exactly at µ = 0 and µ = 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import comb
+from typing import Protocol
+
+import numpy as np
+
+SUM_UP_TO = 100
+"""Number of senders up to which the sum over m is as cheap as the nodes of the integral."""
+
+_STEP = 0.1
+_X = np.arange(-4.0, 6.2, _STEP)
+_NODES = np.exp(_X - np.exp(-_X))
+_WEIGHTS = _STEP * _NODES * (1.0 + np.exp(-_X))
+_TINY = 1e-290
+_BLOCK = 128
+
+
+class Arrivals(Protocol):
+    """Distribution of the number of arriving messages, one per item of the last axis."""
+
+    def remaining(self, s: np.ndarray) -> np.ndarray:
+        """E(s) for s ≥ 0 of shape (..., items)."""
+        ...
+
+    def gained(self, s: np.ndarray) -> np.ndarray:
+        """g(s) for s ≥ 0 of shape (..., items)."""
+        ...
+
+    def reciprocal(self) -> np.ndarray:
+        """E[1/(m+1)], shape (items,): what remains at step 1, where independent initial estimates are averaged."""
+        ...
+
+    def take(self, items: np.ndarray) -> Arrivals:
+        """Return the distributions of some items."""
+        ...
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Any distribution of the number of messages, as a table.
+
+    Parameters
+    ----------
+    weights : (N + 1, items) probability of m = 0 … N arrivals.
+    """
+
+    weights: np.ndarray
+
+    def remaining(self, s: np.ndarray) -> np.ndarray:
+        """E(s)."""
+        return self._average(s, self.weights)
+
+    def gained(self, s: np.ndarray) -> np.ndarray:
+        """g(s)."""
+        return self._average(s, self.weights * self._arrived)
+
+    def reciprocal(self) -> np.ndarray:
+        """E[1/(m+1)]."""
+        return (self.weights / self._arrived).sum(axis=0)
+
+    def take(self, items: np.ndarray) -> Counts:
+        """Return the distributions of some items."""
+        return Counts(self.weights[:, items])
+
+    @property
+    def _arrived(self) -> np.ndarray:
+        return np.arange(1.0, len(self.weights) + 1)[:, None]
+
+    def _average(self, s: np.ndarray, numerator: np.ndarray) -> np.ndarray:
+        noise = 1.0 / np.maximum(s, _TINY)
+        columns = (-1, *(1,) * (noise.ndim - 1), numerator.shape[-1])
+        total = np.zeros_like(noise)
+        for first in range(0, len(numerator), _BLOCK):
+            block = numerator[first : first + _BLOCK].reshape(columns)
+            terms = np.add.outer(np.arange(first + 1.0, first + len(block) + 1), noise)
+            total += np.divide(block, terms, out=terms).sum(axis=0)
+        return total * noise
+
+
+@dataclass(frozen=True)
+class Binomial:
+    """Many like senders, each heard with probability µ, thesis (50), by the integrals.
+
+    Parameters
+    ----------
+    senders : N, the number of possible messages.
+    link : (items,) the link probability µ.
+    """
+
+    senders: int
+    link: np.ndarray
+
+    def remaining(self, s: np.ndarray) -> np.ndarray:
+        """E(s)."""
+        return self._integral(s, gained=False)
+
+    def gained(self, s: np.ndarray) -> np.ndarray:
+        """g(s)."""
+        return self._integral(s, gained=True)
+
+    def reciprocal(self) -> np.ndarray:
+        """(1 − (1−µ)^n)/(nµ) with n = N + 1."""
+        n = self.senders + 1
+        positive = self.link > 0
+        µ = np.where(positive, self.link, 1.0)
+        with np.errstate(divide="ignore"):
+            return np.where(positive, -np.expm1(n * np.log1p(-µ)) / (n * µ), 1.0)
+
+    def take(self, items: np.ndarray) -> Binomial:
+        """Return the distributions of some items."""
+        return Binomial(self.senders, self.link[items])
+
+    def _integral(self, s: np.ndarray, *, gained: bool) -> np.ndarray:
+        N, µ = self.senders, self.link
+        rate = 1.0 + s + N * µ * s
+        total = np.zeros_like(rate)
+        with np.errstate(divide="ignore", under="ignore"):
+            for node, weight in zip(_NODES, _WEIGHTS, strict=True):
+                t = node / rate
+                missing = np.expm1(-t * s)
+                log_φ = np.log1p(µ * missing)
+                term = weight * np.exp(N * log_φ - t * (1.0 + s))
+                if gained:
+                    term += term * (N * µ) * (1.0 + missing) * np.exp(-np.maximum(log_φ, -700.0))
+                total += term
+        return total / rate
+
+
+def like_senders(senders: int, link: np.ndarray) -> Arrivals:
+    """Distribution of arrivals from N senders that are heard with the same probability, thesis (50).
+
+    Parameters
+    ----------
+    senders : N ≥ 0.
+    link : (items,) probability µ of each item.
+    """
+    if senders > SUM_UP_TO:
+        return Binomial(senders, link)
+    m = np.arange(senders + 1)[:, None]
+    coefficients = np.array([[float(comb(senders, i))] for i in range(senders + 1)])
+    weights = coefficients * link**m * (1.0 - link) ** (senders - m)
+    return Counts(weights / weights.sum(axis=0))
+
+
+def poisson_binomial(link: np.ndarray) -> np.ndarray:
+    """Distribution of the number of arrivals over unequal links, thesis (45)/(46) summed by count.
+
+    Parameters
+    ----------
+    link : (N, ...) probability of each of N independent messages.
+
+    Returns
+    -------
+    ndarray
+        (N + 1, ...) probability of 0 … N arrivals.  Every term is positive: no cancellation.
+    """
+    pmf = np.zeros((len(link) + 1, *link.shape[1:]))
+    pmf[0] = 1.0
+    for j, µ in enumerate(link):
+        pmf[1 : j + 2] = pmf[1 : j + 2] * (1.0 - µ) + pmf[: j + 1] * µ
+        pmf[0] *= 1.0 - µ
+    return pmf

@@ -1,0 +1,115 @@
+"""The Kalman update averaged over the number of arriving measurements: (54) in three numeric forms.
+
+(54) is P = Σ β(m) P_m with P_m = update(P⁻, R/(m+1)) (`stochfuse.simplified` writes it so, and the tests prove
+the identity).  None of the forms below builds the P_m; each needs only the averages E and g of `stochfuse.arrivals`.
+
+Scalar state
+    P = P⁻ E(P⁻ J), with J = HᵀR⁻¹H.
+Measurement space, for any state: with R = C Cᵀ and C⁻¹ H P⁻ HᵀC⁻ᵀ = U diag(s) Uᵀ,
+    P = P⁻ − W diag(g(s)) Wᵀ,  W = P⁻HᵀC⁻ᵀU.
+    Symmetric matrices are kept as their upper triangles with the batch in the last axis (struct of arrays), so that
+    predict and the products with H are one matrix multiplication of a small constant matrix with the whole batch.
+Square root, where the measurement is so precise that the subtraction would cancel
+    `stochfuse.kalman.update_factor` with E in the place of 1/(1 + s).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from stochfuse.arrivals import Arrivals
+from stochfuse.kalman import Estimate, predict
+
+
+@lru_cache(maxsize=64)
+def triangle(d: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Indices of the upper triangle (rows, columns), and the (d, d) map from an entry to its place there."""
+    rows, columns = np.triu_indices(d)
+    place = np.zeros((d, d), dtype=int)
+    place[rows, columns] = place[columns, rows] = np.arange(len(rows))
+    return rows, columns, place
+
+
+def linear_map(F: np.ndarray, whitened: np.ndarray) -> np.ndarray:
+    """Matrix that takes the upper triangle of P to those of F P Fᵀ, A F P Fᵀ and A F P FᵀAᵀ, stacked, with A = C⁻¹H.
+
+    It is read off the kernel's own `predict`, applied to a basis of the symmetric matrices.
+    """
+    d = F.shape[-1]
+    rows, columns, _ = triangle(d)
+    basis = np.zeros((len(rows), d, d))
+    basis[np.arange(len(rows)), rows, columns] = basis[np.arange(len(rows)), columns, rows] = 1.0
+    return _stack(predict(Estimate(None, basis), F, np.zeros_like(F)).P, whitened).T
+
+
+def offset(Q: np.ndarray, whitened: np.ndarray) -> np.ndarray:
+    """What Q adds to each row of `linear_map`, as a column."""
+    return _stack(Q[None], whitened).T
+
+
+def _stack(P: np.ndarray, A: np.ndarray) -> np.ndarray:
+    rows, columns, _ = triangle(P.shape[-1])
+    p_rows, p_columns, _ = triangle(len(A))
+    AP = A @ P
+    S = AP @ A.T
+    return np.concatenate([P[:, rows, columns], AP.reshape(len(P), -1), S[:, p_rows, p_columns]], axis=1)
+
+
+def update_scalar(stacked: np.ndarray, J: float, arrivals: Arrivals) -> np.ndarray:
+    """P = P⁻ E(P⁻J) for a scalar state: P of shape (1, items) from the first row of `linear_map`'s stack."""
+    prior = stacked[:1]
+    return prior * arrivals.remaining(prior * J)
+
+
+def update_measurement_space(
+    stacked: np.ndarray, d: int, p: int, arrivals: Arrivals
+) -> tuple[np.ndarray, np.ndarray]:
+    """Average the update in measurement space.
+
+    Parameters
+    ----------
+    stacked : (rows, items) the prior as `linear_map` and `offset` give it.
+    d, p : number of states and of measurements.
+    arrivals : distribution of the number of messages, per item.
+
+    Returns
+    -------
+    P : (d(d+1)/2, items) upper triangle of the averaged posterior.
+    left : (items,) smallest share of prior variance that is left in any measured direction.  The subtraction
+        loses about log10(1/left) digits.
+    """
+    n = d * (d + 1) // 2
+    prior, AP, S = stacked[:n], stacked[n : n + p * d].reshape(p, d, -1), stacked[n + p * d :]
+    s, W = _diagonalise(S, AP, p)
+    g = arrivals.gained(s)
+    left = (1.0 - s * g).min(axis=0)
+    rows, columns, _ = triangle(d)
+    gW = g[:, None, :] * W
+    P = prior - gW[0, rows] * W[0, columns]
+    for i in range(1, p):
+        P -= gW[i, rows] * W[i, columns]
+    return P, left
+
+
+def _diagonalise(S: np.ndarray, AP: np.ndarray, p: int) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvalues (p, items) of S and the rows of AP turned into the eigenvectors' directions."""
+    if p == 1:
+        return np.maximum(S, 0.0), AP
+    if p == 2:
+        a, b, c = S
+        half = 0.5 * (c - a)
+        root = np.sqrt(half * half + b * b)
+        # tan of the Jacobi angle, from the smaller rotation: no cancellation for near-equal eigenvalues
+        size = np.abs(half) + root
+        t = np.divide(np.copysign(b, half * b), size, out=np.zeros_like(b), where=size > 0)
+        cos = 1.0 / np.sqrt(1.0 + t * t)
+        sin = t * cos
+        s = np.stack([a - t * b, c + t * b])
+        W = np.stack([cos * AP[0] - sin * AP[1], sin * AP[0] + cos * AP[1]])
+        return np.maximum(s, 0.0), W
+    place = triangle(p)[2]
+    s, U = np.linalg.eigh(np.moveaxis(S[place], -1, 0))
+    W = np.einsum("bqj,qdb->jdb", U, AP)
+    return np.maximum(s.T, 0.0), W

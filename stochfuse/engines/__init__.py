@@ -1,0 +1,1 @@
+"""Engines average an estimator over chance."""

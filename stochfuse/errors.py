@@ -1,0 +1,45 @@
+"""What can go wrong, said so that the user can mend it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+
+class Problem(NamedTuple):
+    """One offending key: its path, what was expected there and what came."""
+
+    path: str
+    expected: str
+    got: str
+
+    def __str__(self) -> str:
+        return f"{self.path}: expected {self.expected}, got {self.got}"
+
+
+class StochfuseError(Exception):
+    """Base of the errors that a user can mend."""
+
+
+class ScenarioError(StochfuseError, ValueError):
+    """A scenario that cannot be read or does not fit together; names every offending key.
+
+    Parameters
+    ----------
+    source : where the scenario came from (a file's name, a preset's).
+    problems : the offending keys, or one sentence where no key is to blame.
+    """
+
+    def __init__(self, source: str, problems: Iterable[Problem] | str):
+        self.source = source
+        self.problems = () if isinstance(problems, str) else tuple(problems)
+        text = problems if isinstance(problems, str) else "".join(f"\n  {p}" for p in self.problems)
+        super().__init__(f"{source}:{' ' if isinstance(problems, str) else ''}{text}")
+
+
+class UsageError(StochfuseError, ValueError):
+    """A request that does not fit the scenario or the method."""
+
+
+class NoAnswerError(StochfuseError):
+    """The question has no answer: the filter diverges, the target cannot be reached."""

@@ -1,0 +1,95 @@
+"""One number out of a covariance: trace, determinant, largest eigenvalue, one state, RMS of a sub-block.
+
+A metric is named as the command line takes it: `trace`, `det`, `max-eig`, `var:x`, `std:x` or `rms:x,y` (the root of the
+sum of the named states' variances), with the states' own names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from stochfuse.errors import UsageError
+from stochfuse.model import Model
+
+NAMES = "trace, det, max-eig, var:STATE, std:STATE or rms:STATE,STATE,…"
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A number per covariance.
+
+    Parameters
+    ----------
+    name : as the command line takes it.
+    label : for people: what it is, of which states.
+    unit : its unit; empty if the states have none or different ones.
+    of : the function, from (..., d, d) to (...).
+    mixed : whether it adds up quantities of different units.
+    """
+
+    name: str
+    label: str
+    unit: str
+    of: Callable[[np.ndarray], np.ndarray]
+    mixed: bool = False
+
+
+def metric(name: str, model: Model) -> Metric:
+    """Return the metric of a name.
+
+    Raises
+    ------
+    UsageError
+        If there is no such metric or state.
+    """
+    kind, _, rest = name.partition(":")
+    everything = ", ".join(model.states)
+    if kind in ("trace", "det", "max-eig") and not rest:
+        mixed = len(set(model.units)) > 1
+        unit = model.units[0]
+        square = _power(unit, 2)
+        if kind == "trace":
+            label = f"trace over {everything}" if model.dimension > 1 else f"variance of {everything}"
+            return Metric(name, label, "" if mixed else square, _trace, mixed)
+        if kind == "max-eig":
+            return Metric(name, f"largest eigenvalue over {everything}", "" if mixed else square, _largest, mixed)
+        units = " ".join(filter(None, (_power(u, 2) for u in model.units)))
+        return Metric(name, f"determinant over {everything}", units, np.linalg.det)
+    if kind in ("var", "std", "rms") and rest:
+        chosen = [_index(name, state.strip(), model) for state in rest.split(",")]
+        if kind != "rms" and len(chosen) > 1:
+            raise UsageError(f"metric '{name}': expected one state, got {len(chosen)}; use rms: for several")
+        units = {model.units[i] for i in chosen}
+        unit, mixed = (units.pop(), False) if len(units) == 1 else ("", True)
+        names = ", ".join(model.states[i] for i in chosen)
+        if kind == "var":
+            return Metric(name, f"variance of {names}", _power(unit, 2), lambda P: P[..., chosen[0], chosen[0]])
+        if kind == "std":
+            return Metric(name, f"standard deviation of {names}", unit, lambda P: np.sqrt(P[..., chosen[0], chosen[0]]))
+        root = f"RMS of {names} (root of the summed variances)" if len(chosen) > 1 else f"RMS of {names}"
+        return Metric(name, root, unit, lambda P: np.sqrt(_trace(P[..., chosen, :][..., chosen])), mixed)
+    raise UsageError(f"metric: expected {NAMES}, got '{name}'")
+
+
+def _index(name: str, state: str, model: Model) -> int:
+    if state not in model.states:
+        raise UsageError(f"metric '{name}': no state '{state}'; the states are {', '.join(model.states)}")
+    return model.states.index(state)
+
+
+def _trace(P: np.ndarray) -> np.ndarray:
+    return np.trace(P, axis1=-2, axis2=-1)
+
+
+def _largest(P: np.ndarray) -> np.ndarray:
+    return np.linalg.eigvalsh(P)[..., -1]
+
+
+def _power(unit: str, exponent: int) -> str:
+    if not unit:
+        return ""
+    superscript = "²" if exponent == 2 else f"^{exponent}"
+    return f"({unit}){superscript}" if "/" in unit else f"{unit}{superscript}"

@@ -1,0 +1,57 @@
+"""The linear-Gaussian model and its sensors, thesis (21)/(22).
+
+    x(k) = F x(k−1) + B u + G v      v ~ N(0, Q)
+    z(k) = H x(k) + w                w ~ N(0, R)
+
+Every matrix is either constant or given per step, with the step on the first axis.  The entry of step 1 of
+F, Q, G, B, u, H and R is never used: at step 1 the agents exchange their initial estimates, before any
+prediction or measurement (see `stochfuse.scenario`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+def at_step(matrix: np.ndarray, step: int) -> np.ndarray:
+    """Return the matrix that holds at a step, counted from 1: itself if constant, else its entry."""
+    return matrix if matrix.ndim == 2 else matrix[step - 1]
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """What an agent measures: H (p, d) and R (p, p), each constant or with a leading step axis."""
+
+    H: np.ndarray
+    R: np.ndarray
+
+
+@dataclass(frozen=True)
+class Model:
+    """How the state moves, and what its components are called.
+
+    Parameters
+    ----------
+    F : (d, d) or (steps, d, d) state transition.
+    Q : (d, d) or (steps, d, d) process noise as it enters the state, G Q Gᵀ.
+    Bu : (d, 1) or (steps, d, 1) known input B u.
+    states, units : d names and d units; a unit may be empty.
+    """
+
+    F: np.ndarray
+    Q: np.ndarray
+    Bu: np.ndarray
+    states: tuple[str, ...]
+    units: tuple[str, ...]
+
+    @property
+    def dimension(self) -> int:
+        """Number d of state components."""
+        return self.F.shape[-1]
+
+    @property
+    def varies(self) -> bool:
+        """Whether any matrix depends on the step."""
+        return max(self.F.ndim, self.Q.ndim, self.Bu.ndim) > 2

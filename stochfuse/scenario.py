@@ -1,0 +1,338 @@
+"""A scenario: everything that is given.  Read from TOML or JSON, checked once, frozen.
+
+    schema = "stochfuse.scenario/1"
+    [model]      F, H, Q, R as nested lists or a number; optional G, B, u; optional states and units (names)
+    [initial]    P, correlation = "independent" | "shared", optional x and error (a known initial bias)
+    [network]    agents, steps, architecture, link = number | matrix | one of either per step, optional delay, case
+    [[agent]]    optional, for unlike agents: its own H, R
+
+Step 1 holds the agents' initial estimates and the first exchange: nothing is predicted or measured before it (thesis
+3.1).  With correlation = "independent" the initial errors are the agents' own, so that nothing is shared at step 1;
+with "shared" all agents start from one common estimate.
+"""
+
+from __future__ import annotations
+
+import copy
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stochfuse.checks import Checker, shown
+from stochfuse.errors import Problem, ScenarioError
+from stochfuse.model import Model, Sensor
+from stochfuse.network import ARCHITECTURES, Network
+
+SCHEMA = "stochfuse.scenario/1"
+DEFAULT = "thesis-transient"
+CORRELATIONS = ("independent", "shared")
+_PRESETS = Path(__file__).parent / "presets"
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A checked scenario; make one with `load_scenario` or `Scenario.from_mapping`.
+
+    Parameters
+    ----------
+    name : the preset's or the file's name.
+    model : how the state moves.
+    sensors : the different sensors among the agents.
+    sensor_of : index into `sensors` for every agent.
+    P0 : (d, d) covariance of each agent's initial estimate.
+    correlation : "independent" or "shared".
+    x0 : (d, 1) initial state estimate.
+    error : (d, 1) known initial error, or None.
+    network : agents and links.
+    metric : the metric that the scenario asks to be shown, or None.
+    source : the mapping it was made from, as the file has it.
+    """
+
+    name: str
+    model: Model
+    sensors: tuple[Sensor, ...]
+    sensor_of: tuple[int, ...]
+    P0: np.ndarray
+    correlation: str
+    x0: np.ndarray
+    error: np.ndarray | None
+    network: Network
+    metric: str | None
+    source: Mapping[str, Any]
+
+    @classmethod
+    def from_mapping(cls, mapping: Mapping[str, Any], name: str = "scenario") -> Scenario:
+        """Check a mapping with a scenario file's keys and make the scenario.
+
+        Raises
+        ------
+        ScenarioError
+            Naming every offending key, what was expected there and what came.
+        """
+        from stochfuse.schema import structure_problems
+
+        return _build(mapping, name, structure_problems(mapping))
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the mapping that the scenario was made from, with a file's keys."""
+        return {"schema": SCHEMA, **copy.deepcopy(dict(self.source))}
+
+
+def preset_names() -> list[str]:
+    """Names of the scenarios that come with the package."""
+    return sorted(path.stem for path in _PRESETS.glob("*.toml"))
+
+
+def load_scenario(source: str | Path = DEFAULT, **overrides: Any) -> Scenario:
+    """Read a scenario.
+
+    Parameters
+    ----------
+    source : a preset's name, a TOML or JSON file's path, or "-" for standard input.
+    **overrides : agents, steps, architecture, q, r, p0: numbers that take the place of network.agents, network.steps,
+        network.architecture, model.Q, model.R and initial.P; `uniform_link=True` drops the file's link and cases, for a
+        caller who gives the link probability.  For a state of several dimensions a number is that multiple of the
+        identity.
+
+    Raises
+    ------
+    ScenarioError
+        If the file is missing or malformed, or naming every offending key.
+    """
+    name, text = read_text(source)
+    mapping = _override(parse(name, text), overrides)
+    if is_preset(source):
+        # the presets' structure is checked by the tests; pydantic would double the time of a plain `predict`
+        return _build(mapping, name, [])
+    return Scenario.from_mapping(mapping, name)
+
+
+def is_preset(source: str | Path) -> bool:
+    """Whether a source names a preset (a file of that name in the working directory does not hide it)."""
+    return isinstance(source, str) and source in preset_names()
+
+
+def read_text(source: str | Path) -> tuple[str, str]:
+    """Return name and text of a preset, a file or standard input."""
+    if is_preset(source):
+        return str(source), (_PRESETS / f"{source}.toml").read_text(encoding="utf-8")
+    if source == "-":
+        return "standard input", sys.stdin.read()
+    path = Path(source)
+    try:
+        return str(path), path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        known = ", ".join(preset_names())
+        raise ScenarioError(str(path), f"no such file, and no preset of that name (presets: {known})") from None
+    except UnicodeDecodeError as error:
+        raise ScenarioError(str(path), f"not a text file in UTF-8 (byte {error.start})") from None
+    except OSError as error:
+        raise ScenarioError(str(path), f"cannot be read: {error.strerror}") from None
+
+
+def parse(name: str, text: str) -> dict[str, Any]:
+    """Parse TOML, or JSON if the text begins with a brace."""
+    try:
+        if text.lstrip("\ufeff \t\r\n").startswith("{"):
+            import json
+
+            mapping = json.loads(text.lstrip("\ufeff"))
+        else:
+            import tomllib
+
+            mapping = tomllib.loads(text.lstrip("\ufeff"))
+    except RecursionError:
+        raise ScenarioError(name, "nested too deeply") from None
+    except ValueError as error:
+        raise ScenarioError(name, f"not valid {'JSON' if 'json' in type(error).__module__ else 'TOML'}: {error}") from None
+    if not mapping:
+        raise ScenarioError(name, "empty; see `stochfuse scenario new`")
+    return mapping
+
+
+def _override(mapping: dict[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    places = {
+        "agents": ("network", "agents"),
+        "steps": ("network", "steps"),
+        "architecture": ("network", "architecture"),
+        "q": ("model", "Q"),
+        "r": ("model", "R"),
+        "p0": ("initial", "P"),
+    }
+    network = mapping.get("network")
+    if overrides.get("uniform_link") and isinstance(network, dict):
+        mapping["network"] = {key: value for key, value in network.items() if key not in ("link", "case")}
+    for key, value in overrides.items():
+        if value is None or key == "uniform_link":
+            continue
+        if key not in places:
+            raise TypeError(f"load_scenario() got an unexpected keyword argument '{key}'")
+        table, entry = places[key]
+        if isinstance(mapping.setdefault(table, {}), dict):
+            mapping[table][entry] = value
+    return mapping
+
+
+def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> Scenario:
+    if not isinstance(mapping, Mapping):
+        raise ScenarioError(name, structure)
+    check = Checker(skip={problem.path for problem in structure})
+    tables = {key: mapping[key] if isinstance(mapping.get(key), dict) else {} for key in ("model", "initial", "network")}
+    network = _network(check, tables["network"])
+    steps = network.steps if network else 1
+    model, default = _model(check, tables["model"], steps)
+    d = model.dimension if model else None
+    sensors, sensor_of = _sensors(check, mapping.get("agent"), default, d, network)
+    initial = tables["initial"]
+    P0 = check.covariance("initial.P", initial.get("P"), d, 0)
+    correlation = check.choice("initial.correlation", initial.get("correlation", "independent"), CORRELATIONS)
+    x0 = check.vector("initial.x", initial.get("x"), d)
+    error = check.vector("initial.error", initial.get("error"), d)
+    report = mapping.get("report")
+    metric = report.get("metric") if isinstance(report, dict) else None
+    problems = [*structure, *check.problems]
+    if problems:
+        raise ScenarioError(name, problems)
+    if model is None or network is None or P0 is None or correlation is None:
+        raise ScenarioError(name, "incomplete: [model], [initial] and [network] are needed")
+    return Scenario(
+        name=name,
+        model=model,
+        sensors=sensors,
+        sensor_of=sensor_of,
+        P0=P0,
+        correlation=correlation,
+        x0=np.zeros((model.dimension, 1)) if x0 is None else x0,
+        error=error,
+        network=network,
+        metric=metric,
+        source={key: value for key, value in mapping.items() if key != "schema"},
+    )
+
+
+def _network(check: Checker, table: Mapping[str, Any]) -> Network | None:
+    agents = check.integer("network.agents", table.get("agents"), 1)
+    steps = check.integer("network.steps", table.get("steps"), 1)
+    architecture = check.choice("network.architecture", table.get("architecture", "ad-hoc"), ARCHITECTURES)
+    if agents is None or steps is None or architecture is None:
+        return None
+    link = _link(check, "network.link", table.get("link"), agents, steps, architecture)
+    cases = []
+    for i, case in enumerate(table.get("case") or [], start=1):
+        if not isinstance(case, dict):
+            continue
+        path = f"network.case[{i}].link"
+        own = link if case.get("link") is None else _link(check, path, case["link"], agents, steps, architecture)
+        if own is None and case.get("link") is None:
+            check.note(path, "a link probability here or in network.link", "nothing")
+        elif own is not None:
+            cases.append((str(case.get("name", i)), own))
+    return Network(agents, steps, architecture, link, tuple(cases), _delay(check, table.get("delay")))
+
+
+def _link(check: Checker, path: str, value: Any, agents: int, steps: int, architecture: str) -> np.ndarray | None:
+    link = check.link(path, value, agents, steps)
+    if link is not None and link.ndim >= 2 and architecture == "broadcast":
+        others = np.where(np.eye(agents, dtype=bool), np.nan, link)
+        with np.errstate(invalid="ignore"):
+            uneven = agents > 2 and (np.nanmax(others, axis=-2) != np.nanmin(others, axis=-2)).any()
+        if uneven:
+            check.note(path, "equal probabilities in each column (a broadcast is heard by all or by none)", "unequal ones")
+    return link
+
+
+def _delay(check: Checker, value: Any) -> tuple[float, ...]:
+    array = check.array("network.delay", value, "a number of steps or a list of probabilities")
+    if array is None:
+        return (1.0,)
+    if array.ndim == 0:
+        if array < 0 or array != int(array):
+            check.note("network.delay", "a whole number of steps, or the probabilities of 0, 1, 2 … steps", shown(value))
+            return (1.0,)
+        return (0.0,) * int(array) + (1.0,)
+    if array.ndim != 1 or not array.size or (array < 0).any() or abs(array.sum() - 1) > 1e-9:
+        check.note("network.delay", "probabilities of 0, 1, 2 … steps that sum to 1", shown(value))
+        return (1.0,)
+    return tuple(array.tolist())
+
+
+def _model(check: Checker, table: Mapping[str, Any], steps: int) -> tuple[Model | None, Sensor | None]:
+    F = check.matrix("model.F", table.get("F"), None, None, steps)
+    if F is not None and F.shape[-1] != F.shape[-2]:
+        check.note("model.F", "a square matrix", f"a {F.shape[-2]}×{F.shape[-1]} matrix")
+        F = None
+    d = None if F is None else F.shape[-1]
+    G = check.matrix("model.G", table.get("G"), d, None, steps, identity=True)
+    noises = G.shape[-1] if G is not None else None if table.get("G") is not None else d
+    Q = check.covariance("model.Q", table.get("Q"), noises, steps)
+    B = check.matrix("model.B", table.get("B"), d, None, steps)
+    u = check.vector("model.u", table.get("u"), None if B is None else B.shape[-1], steps)
+    if table.get("u") is not None and table.get("B") is None:
+        check.note("model.B", "an input matrix, since model.u is given", "nothing")
+    states = _names(check, "model.states", table.get("states"), d)
+    units = _names(check, "model.units", table.get("units"), d)
+    default = _sensor(check, "model", table, d, steps, None)
+    if F is None or Q is None or d is None:
+        return None, default
+    model = Model(
+        F=F,
+        Q=Q if G is None else G @ Q @ np.swapaxes(G, -1, -2),
+        Bu=np.zeros((d, 1)) if B is None or u is None else B @ u,
+        states=states or tuple("x" if d == 1 else f"x{i}" for i in range(1, d + 1)),
+        units=units or ("",) * d,
+    )
+    return model, default
+
+
+def _names(check: Checker, path: str, value: Any, d: int | None) -> tuple[str, ...] | None:
+    if not isinstance(value, list) or d is None:
+        return None
+    if len(value) != d:
+        check.note(path, f"{d} names, one per state", f"{len(value)}")
+    elif path.endswith("states") and len(set(value)) < d:
+        check.note(path, "different names", shown(value))
+    return tuple(map(str, value))
+
+
+def _sensor(
+    check: Checker, path: str, table: Mapping[str, Any], d: int | None, steps: int, default: Sensor | None
+) -> Sensor | None:
+    if table.get("H") is None and default is not None:
+        H = default.H
+    else:
+        H = check.matrix(f"{path}.H", table.get("H"), None, d, steps)
+    if table.get("R") is None and default is not None:
+        R = default.R
+        if H is not None and R.shape[-1] != H.shape[-2]:
+            check.note(f"{path}.R", f"a {H.shape[-2]}×{H.shape[-2]} matrix, to go with its own H", "nothing")
+    else:
+        R = check.covariance(f"{path}.R", table.get("R"), None if H is None else H.shape[-2], steps, definite=True)
+    return None if H is None or R is None else Sensor(H, R)
+
+
+def _sensors(
+    check: Checker, agents: Any, default: Sensor | None, d: int | None, network: Network | None
+) -> tuple[tuple[Sensor, ...], tuple[int, ...]]:
+    if network is None or default is None:
+        return (), ()
+    if not agents:
+        return (default,), (0,) * network.agents
+    if len(agents) != network.agents:
+        check.note("agent", f"one [[agent]] table for each of the {network.agents} agents", f"{len(agents)}")
+        return (), ()
+    different: dict[tuple[Any, ...], int] = {}
+    sensors, sensor_of = [], []
+    for i, table in enumerate(agents, start=1):
+        sensor = _sensor(check, f"agent[{i}]", table if isinstance(table, dict) else {}, d, network.steps, default)
+        if sensor is None:
+            continue
+        key = (sensor.H.shape, sensor.H.tobytes(), sensor.R.shape, sensor.R.tobytes())
+        if key not in different:
+            different[key] = len(sensors)
+            sensors.append(sensor)
+        sensor_of.append(different[key])
+    return tuple(sensors), tuple(sensor_of)

@@ -1,0 +1,174 @@
+"""The structure of a scenario file, for pydantic: which keys there are and what kind of value each takes.
+
+Whether the numbers fit together (shapes, definiteness, probabilities) is checked in `stochfuse.scenario`, for every
+scenario, wherever it comes from.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
+
+from stochfuse.checks import shown
+from stochfuse.errors import Problem
+
+Number = Annotated[int, Strict()] | Annotated[float, Strict()]
+Vector = Number | list[Number] | list[list[Number]]
+Matrix = Number | list[list[Number]] | list[list[list[Number]]]
+Link = Number | list[Number | list[Number] | list[list[Number]]]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=True)
+
+
+class ModelTable(_Table):
+    """Linear-Gaussian model x(k) = F x(k−1) + B u + G v, z(k) = H x(k) + w, with v ~ N(0, Q), w ~ N(0, R)."""
+
+    F: Matrix = Field(description="state transition, d×d; its size is the number of states")
+    H: Matrix = Field(description="measurement matrix, p×d")
+    Q: Matrix = Field(description="process noise covariance, d×d, or as many as G has columns")
+    R: Matrix = Field(description="measurement noise covariance, p×p, positive definite")
+    G: Matrix | None = Field(None, description="process noise gain, default the identity")
+    B: Matrix | None = Field(None, description="input matrix")
+    u: Vector | None = Field(None, description="known input, needs B")
+    states: list[str] | None = Field(None, description="names of the states")
+    units: list[str] | None = Field(None, description="units of the states")
+
+
+class InitialTable(_Table):
+    """The estimates that the agents start with, at step 1."""
+
+    P: Matrix = Field(description="covariance of each agent's first estimate, d×d")
+    correlation: Literal["independent", "shared"] = Field(
+        "independent", description="whether the agents' first errors are independent, or all start from one estimate"
+    )
+    x: Vector | None = Field(None, description="first state estimate, default zero")
+    error: Vector | None = Field(None, description="known initial error (bias), common to all agents")
+
+
+class CaseTable(_Table):
+    """A named alternative to network.link."""
+
+    name: str
+    link: Link | None = Field(None, description="as network.link; default network.link itself")
+
+
+class NetworkTable(_Table):
+    """Who may hear whom, and how likely."""
+
+    agents: int = Field(ge=1, strict=True, description="number of agents")
+    steps: int = Field(ge=1, strict=True, description="number of time steps; step 1 exchanges the first estimates")
+    architecture: Literal["ad-hoc", "broadcast", "cyclic"] = "ad-hoc"
+    link: Link | None = Field(
+        None,
+        description="link probability: a number, a matrix (row: receiver, column: sender), or one of either per step; "
+        "left out, it is tabulated from 0 to 1",
+    )
+    delay: Number | list[Number] | None = Field(
+        None, description="delay of messages in steps, or the probabilities of a delay of 0, 1, 2 … steps"
+    )
+    case: list[CaseTable] | None = Field(None, description="named alternatives to link, one row of the table each")
+
+
+class AgentTable(_Table):
+    """One agent's own sensor, where it differs from the model's."""
+
+    H: Matrix | None = None
+    R: Matrix | None = None
+
+
+class ReportTable(_Table):
+    """How results are shown where the command does not say."""
+
+    metric: str | None = Field(None, description="default metric, as --metric takes it")
+
+
+class ScenarioFile(_Table):
+    """A stochfuse scenario."""
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, title="stochfuse scenario", populate_by_name=False, serialize_by_alias=True
+    )
+
+    schema_: Literal["stochfuse.scenario/1"] = Field("stochfuse.scenario/1", alias="schema")
+    description: str | None = None
+    model: ModelTable
+    initial: InitialTable
+    network: NetworkTable
+    agent: list[AgentTable] | None = Field(None, description="one entry per agent, for unlike agents")
+    report: ReportTable | None = None
+
+
+_KINDS = {
+    "extra_forbidden": "a known key",
+    "missing": "a value",
+    "string_type": "text",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "float_type": "a number",
+    "list_type": "a list",
+    "model_type": "a table",
+    "dict_type": "a table",
+    "model_attributes_type": "a table",
+}
+
+_SHAPES = {
+    "matrix": "a number or a matrix (a list of rows), or one such matrix per step",
+    "vector": "a number, a list of numbers, or one list per step",
+    "link": "a probability, a matrix of them, or one of either per step",
+    "delay": "a number of steps or a list of probabilities",
+}
+_SHAPE_OF = {
+    **dict.fromkeys(("F", "H", "Q", "R", "G", "B", "P"), "matrix"),
+    **dict.fromkeys(("u", "x", "error"), "vector"),
+    "link": "link",
+    "delay": "delay",
+}
+
+
+def structure_problems(mapping: Any) -> list[Problem]:
+    """Return every key of a parsed file that is unknown, missing or of the wrong kind, once each."""
+    try:
+        ScenarioFile.model_validate(mapping)
+    except ValidationError as error:
+        problems = {}
+        for entry in error.errors(include_url=False, include_context=True):
+            problem = _problem(entry)
+            problems.setdefault(problem.path, problem)
+        return list(problems.values())
+    return []
+
+
+def _problem(entry: Any) -> Problem:
+    location = list(entry["loc"])
+    for place, part in enumerate(location):
+        if part in _SHAPE_OF and place < len(location) - 1 or (part in _SHAPE_OF and entry["type"].endswith("_type")):
+            # a union reports one error per alternative: say once what the key takes
+            return Problem(_path(location[: place + 1]), _SHAPES[_SHAPE_OF[part]], _got(entry, location[place + 1 :]))
+    kind, context = entry["type"], entry.get("ctx", {})
+    if kind == "literal_error":
+        expected = "one of " + str(context["expected"]).replace("'", '"').replace(" or ", ", ")
+    elif kind == "greater_than_equal":
+        expected = f"a whole number of at least {context['ge']}"
+    else:
+        expected = _KINDS.get(kind, str(entry["msg"]))
+    if kind == "extra_forbidden":
+        got = f"an unknown one, '{location[-1]}'"
+    else:
+        got = "nothing" if kind == "missing" else shown(entry["input"])
+    return Problem(_path(location) or "scenario", expected, got)
+
+
+def _got(entry: Any, rest: list[Any]) -> str:
+    indices = [part for part in rest if isinstance(part, int)]
+    where = f" at [{', '.join(map(str, indices))}]" if indices else ""
+    return shown(entry["input"]) + where
+
+
+def _path(location: list[Any]) -> str:
+    path = ""
+    for part in location:
+        path += f"[{part + 1}]" if isinstance(part, int) else f".{part}" if path else str(part)
+    return path
