@@ -1,0 +1,5 @@
+"""`python -m stochfuse`."""
+
+from stochfuse.cli import main
+
+main()

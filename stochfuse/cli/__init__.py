@@ -1,0 +1,19 @@
+"""The command line.  It only wires; what is heavy is imported inside the commands that need it."""
+
+from __future__ import annotations
+
+import sys
+
+
+def main() -> None:
+    """Run `stochfuse`; Ctrl-C ends it without a traceback at any moment, start-up included."""
+    try:
+        for stream in (sys.stdout, sys.stderr):
+            if hasattr(stream, "reconfigure"):
+                stream.reconfigure(errors="replace")
+        from stochfuse.cli.app import app
+
+        app(prog_name="stochfuse")
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted\n")
+        sys.exit(130)

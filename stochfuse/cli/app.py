@@ -1,0 +1,77 @@
+"""The application: its commands, and what every command does with an error."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from stochfuse import __version__
+from stochfuse.cli import derive, predict, scenario
+from stochfuse.errors import NoAnswerError, ScenarioError, StochfuseError, UsageError
+
+EXIT_FAILURE, EXIT_USAGE, EXIT_NO_ANSWER, EXIT_INTERRUPTED = 1, 2, 3, 130
+
+
+class Group(TyperGroup):
+    """Commands whose errors become one message on stderr and an exit code."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the chosen command."""
+        try:
+            result = super().invoke(ctx)
+            sys.stdout.flush()
+            return result
+        except NoAnswerError as error:
+            _fail(f"no answer: {error}", EXIT_NO_ANSWER)
+        except (ScenarioError, UsageError) as error:
+            _fail(f"error: {error}", EXIT_USAGE)
+        except StochfuseError as error:
+            _fail(f"error: {error}", EXIT_FAILURE)
+        except MemoryError:
+            _fail("error: not enough memory; ask for fewer links, steps or agents at a time", EXIT_FAILURE)
+        except BrokenPipeError:
+            # the reader has seen enough (`| head -1`); keep the interpreter from complaining when it flushes
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(0) from None
+        except KeyboardInterrupt:
+            _fail("interrupted", EXIT_INTERRUPTED)
+
+
+def _fail(message: str, code: int) -> None:
+    typer.echo(message, err=True)
+    raise typer.Exit(code) from None
+
+
+app = typer.Typer(
+    cls=Group,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command("predict")(predict.predict)
+app.command("derive")(derive.derive)
+app.add_typer(scenario.app, name="scenario")
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"stochfuse {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and stop.")
+    ] = False,
+) -> None:
+    """How good will the fused estimate be, as a function of the link probability?
+
+    Expected covariance of distributed Kalman fusion over links that lose messages, computed instead of simulated.
+    Try: stochfuse predict
+    """

@@ -1,0 +1,3 @@
+"""stub"""
+def derive() -> None:
+    """x."""

@@ -1,0 +1,1 @@
+"""Reports format predictions; they compute nothing."""

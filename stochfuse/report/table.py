@@ -1,0 +1,150 @@
+"""A table, and how it looks as text, CSV, Markdown and LaTeX."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from rich import box
+from rich.console import Console
+from rich.table import Table as RichTable
+
+FORMATS = ("table", "csv", "json", "markdown", "latex")
+
+
+@dataclass(frozen=True)
+class Table:
+    """Text cells under headings.
+
+    Parameters
+    ----------
+    title : lines that say what the table shows.
+    keys : headings of the first columns, which name a row.
+    columns : headings of the other columns.
+    rows : cells as text, keys first.
+    """
+
+    title: tuple[str, ...]
+    keys: tuple[str, ...]
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+    @property
+    def headings(self) -> tuple[str, ...]:
+        """All headings, keys first."""
+        return self.keys + self.columns
+
+
+def number(value: float, digits: int = 5) -> str:
+    """Return a number with so many significant digits, trailing zeros kept."""
+    text = f"{value:#.{digits}g}"
+    return text[:-1] if text.endswith(".") else text
+
+
+def to_text(table: Table, width: int | None = 80) -> str:
+    """Return the table for a terminal of some width; what does not fit beside is put below. No width: one wide table."""
+    output = io.StringIO()
+    room = width or 1_000_000
+    console = Console(file=output, width=room, markup=False, highlight=False, emoji=False, color_system=None)
+    for line in table.title:
+        console.print(line, soft_wrap=width is None)
+    for columns in _blocks(table, room):
+        rich = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1), show_edge=True)
+        for index in columns:
+            key = index < len(table.keys)
+            text = key and not all(_numeric(row[index]) for row in table.rows)
+            rich.add_column(
+                table.headings[index], justify="left" if text or not table.columns else "right", no_wrap=not text, overflow="fold"
+            )
+        for row in table.rows:
+            rich.add_row(*(row[index] for index in columns))
+        console.print(rich)
+    return "\n".join(line.rstrip() for line in output.getvalue().rstrip("\n").split("\n")) + "\n"
+
+
+def _numeric(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return not cell
+    return True
+
+
+def _blocks(table: Table, room: int) -> Iterator[list[int]]:
+    """Column indices of each block, keys repeated; at least one further column a block."""
+    widths = [max(len(row[i]) for row in (table.headings, *table.rows)) + 2 for i in range(len(table.headings))]
+    keys = list(range(len(table.keys)))
+    start = used = sum(widths[i] for i in keys)
+    block = list(keys)
+    for i in range(len(keys), len(widths)):
+        if used + widths[i] > room and len(block) > len(keys):
+            yield block
+            block, used = list(keys), start
+        block.append(i)
+        used += widths[i]
+    yield block
+
+
+def to_csv(headings: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """Return comma-separated values, numbers in full precision."""
+    output = io.StringIO()
+    writer = csv.writer(output, lineterminator="\n")
+    writer.writerow(headings)
+    writer.writerows(rows)
+    return output.getvalue()
+
+
+def to_markdown(table: Table) -> str:
+    """Return a Markdown table under its title."""
+
+    def line(cells: Sequence[str]) -> str:
+        return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+    rule = [":--" if i < len(table.keys) else "--:" for i in range(len(table.headings))]
+    body = [line(table.headings), line(rule), *(line(row) for row in table.rows)]
+    return "\n".join([*("" + text + "  " for text in table.title), "", *body]) + "\n"
+
+
+_LATEX = {
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "µ": r"$\mu$", "²": r"$^2$", "³": r"$^3$", "∞": r"$\infty$",
+    "×": r"$\times$", "·": r"$\cdot$", "≥": r"$\geq$", "≤": r"$\leq$", "−": "$-$",
+}  # fmt: skip
+
+
+def latex_text(text: str) -> str:
+    """Escape text for LaTeX."""
+    return "".join(_LATEX.get(character, character) for character in text)
+
+
+def to_latex(table: Table) -> str:
+    r"""Return a LaTeX table environment with caption; needs no package."""
+    align = "l" * len(table.keys) + "r" * len(table.columns)
+
+    def line(cells: Sequence[str]) -> str:
+        return "    " + " & ".join(map(latex_text, cells)) + r" \\"
+
+    return "\n".join(
+        [
+            r"\begin{table}",
+            r"  \caption{" + latex_text(". ".join(table.title)) + ".}",
+            r"  \begin{tabular}{" + align + "}",
+            r"    \hline",
+            line(table.headings),
+            r"    \hline",
+            *(line(row) for row in table.rows),
+            r"    \hline",
+            r"  \end{tabular}",
+            r"\end{table}",
+            "",
+        ]
+    )
+
+
+def render(table: Table, format: str, width: int) -> str:
+    """Return the table as text of a width, Markdown or LaTeX."""
+    if format == "markdown":
+        return to_markdown(table)
+    return to_latex(table) if format == "latex" else to_text(table, width)
