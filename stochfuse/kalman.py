@@ -192,11 +192,21 @@ def update_factor(
     shrink : what remains of the prior variance in a direction whose signal-to-noise ratio is s = σ²;
         takes and returns arrays of shape (..., min(p, d)).  One measurement, the default, leaves 1/(1 + s).
     """
-    whitened = np.linalg.solve(np.linalg.cholesky(R), H @ L)
-    _, sigma, Vt = np.linalg.svd(whitened, full_matrices=True)
-    scale = np.ones((*sigma.shape[:-1], L.shape[-1]))
-    scale[..., : sigma.shape[-1]] = np.sqrt(shrink(sigma**2))
-    return L @ np.swapaxes(Vt, -1, -2) * scale[..., None, :]
+    whitened = np.linalg.solve(np.linalg.cholesky(R), H)
+    U, sigma, Vt = np.linalg.svd(whitened @ L, full_matrices=True)
+    k = sigma.shape[-1]
+    U, V = U[..., :k], np.swapaxes(Vt, -1, -2)
+    left = np.ones((*sigma.shape[:-1], L.shape[-1]))
+    left[..., :k] = np.sqrt(shrink(sigma**2))
+    posterior = L @ V * left[..., None, :]
+    # V is orthogonal to rounding only, which in a direction measured with σ = 1e8 is an error of σ·1e-16: the posterior must
+    # show the sensor exactly UΣ√shrink, and what differs is taken out along the measured directions
+    shown = np.zeros((*sigma.shape[:-1], H.shape[-2], L.shape[-1]))
+    shown[..., :k] = U * (sigma * left[..., :k])[..., None, :]
+    strong = sigma > 1e-3 * np.maximum(sigma[..., :1], 1e3)
+    inverse = np.where(strong, 1.0 / np.where(strong, sigma, 1.0), 0.0)
+    excess = np.swapaxes(U, -1, -2) @ (whitened @ posterior - shown)
+    return posterior - L @ V[..., :k] @ (inverse[..., None] * excess)
 
 
 def from_factor(L: np.ndarray) -> np.ndarray:

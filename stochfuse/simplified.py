@@ -37,7 +37,7 @@ from stochfuse.algebra import NUMPY, Algebra, inverse
 from stochfuse.arrivals import Counts, like_senders, poisson_binomial
 from stochfuse.engines.mean_field import Case, Outcomes, run, run_like
 from stochfuse.errors import UsageError
-from stochfuse.kalman import Estimate, to_information, update
+from stochfuse.kalman import Estimate, from_information, to_information, update, update_information
 from stochfuse.network import LinkRows, number_of_senders, possible_senders
 from stochfuse.scenario import Scenario
 
@@ -48,6 +48,12 @@ MOST_OUTCOMES = 100_000
 def outcome(prior: Estimate, H: Any, R: Any, m: int, z: Any = None, *, algebra: Algebra = NUMPY) -> Estimate:
     """P_m and x̂_m as one update with m + 1 measurements: the identity behind (53)/(54), in any algebra."""
     return update(prior, H, R / (m + 1), z, algebra=algebra)
+
+
+def outcome_by_information(prior: Estimate, H: Any, R: Any, m: int, *, algebra: Algebra = NUMPY) -> Estimate:
+    """P_m in information form, [P⁻¹(k|k−1) + (m+1) HᵀR⁻¹H]⁻¹: the shortest for symbols; the prior must be invertible."""
+    information = update_information(to_information(prior, algebra=algebra), H, R / (m + 1), algebra=algebra)
+    return from_information(information, algebra=algebra)
 
 
 def outcome_as_printed(prior: Estimate, H: Any, R: Any, m: int, z: Any = None, *, algebra: Algebra = NUMPY) -> Estimate:

@@ -39,7 +39,7 @@ def complete_scenario(incomplete: str) -> list[str]:
 ScenarioArgument = Annotated[
     str,
     typer.Argument(
-        metavar="[SCENARIO]",
+        metavar="SCENARIO",
         help="TOML or JSON file, - for standard input, or a preset's name (see `stochfuse scenario list`).",
         autocompletion=complete_scenario,
     ),

@@ -14,9 +14,9 @@ from stochfuse.prediction import Prediction
 from stochfuse.report.table import Table, number, to_csv
 
 SCHEMA = "stochfuse.prediction/1"
-METHOD_TITLES = {"simplified": "simplified stochastic formulation (54)"}
+METHOD_TITLES = {"simplified": "simplified formulation (54)"}
 NATURES = {
-    ("simplified", "approximate"): "approximate: mean field, averaged after every step",
+    ("simplified", "approximate"): "approximate (mean field)",
 }
 
 
@@ -70,7 +70,7 @@ class View:
         unit = f" [{self.unit}]" if self.unit else ", relative to link probability 0" if self.baseline else ""
         if not unit:
             unit = " [mixed units]" if self.metric.mixed else "" if any(p.scenario.model.units) else " [no unit given]"
-        return f"Expected {p.quantity} {p.stage} covariance (after fusion): {self.metric.label}{unit}"
+        return f"Expected {p.quantity} {p.stage} covariance: {self.metric.label}{unit}"
 
     @property
     def whom(self) -> str:
@@ -107,12 +107,13 @@ def predict_table(view: View) -> Table:
     p = view.prediction
     values, steady = view.values(), view.steady()
     columns = [f"k={k}" for k in p.steps] + (["steady"] if steady is not None else [])
+    uniform = p.cases is None and _uniform(p)
     rows = []
     for i, µ in enumerate(p.link):
         name = () if p.cases is None else (p.cases[i],)
         shown = [*values[i], *([] if steady is None else [steady[i]])]
-        rows.append((*name, f"{µ:.6g}", *(number(v, view.digits) for v in shown)))
-    mean = "µ" if p.cases is None and _uniform(p) else "mean µ"
+        rows.append((*name, f"{µ:.6g}" if uniform else f"{µ:.4g}", *(number(v, view.digits) for v in shown)))
+    mean = "µ" if uniform else "mean µ"
     keys = (mean,) if p.cases is None else ("links", mean)
     return Table((view.what, view.whom, view.how), keys, tuple(columns), tuple(rows))
 
