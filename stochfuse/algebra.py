@@ -46,6 +46,8 @@ class _NumPy:
 
     def solve(self, A: Any, B: Any) -> Any:
         if np.shape(A)[-1] == 1:
+            if not np.all(A):
+                raise np.linalg.LinAlgError("Singular matrix")
             return np.divide(B, A)
         return np.linalg.solve(A, B)
 

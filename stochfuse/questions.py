@@ -95,7 +95,8 @@ def _require_detectable(model: Model, sensor: Sensor) -> None:
     d = model.dimension
     for eigenvalue in np.linalg.eigvals(model.F):
         if abs(eigenvalue) >= 1.0 - 1e-9:
-            hautus = np.concatenate([eigenvalue * np.eye(d) - model.F, sensor.H / np.abs(sensor.H).max()])
+            H = sensor.H / max(np.abs(sensor.H).max(), 1e-300)
+            hautus = np.concatenate([eigenvalue * np.eye(d) - model.F, H])
             if np.linalg.svd(hautus, compute_uv=False)[-1] < 1e-10 * max(1.0, abs(eigenvalue)):
                 raise NoAnswerError(
                     f"no steady state: the stand-alone filter does not converge, since the mode of F with eigenvalue "

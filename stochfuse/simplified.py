@@ -68,11 +68,14 @@ def outcome_as_printed(prior: Estimate, H: Any, R: Any, m: int, z: Any = None, *
 
 def average(outcomes: Sequence[Estimate], weights: Sequence[Any]) -> Estimate:
     """Σ β(m)·(x̂_m, P_m): the expectation in (53)/(54), with P_m inside the sum."""
-    P = sum((w * o.P for w, o in zip(weights[1:], outcomes[1:], strict=True)), weights[0] * outcomes[0].P)
-    if outcomes[0].x is None:
-        return Estimate(None, P)
-    x = sum((w * o.x for w, o in zip(weights[1:], outcomes[1:], strict=True)), weights[0] * outcomes[0].x)
-    return Estimate(x, P)
+    P = _weighted([o.P for o in outcomes], weights)
+    return Estimate(None if outcomes[0].x is None else _weighted([o.x for o in outcomes], weights), P)
+
+
+def _weighted(matrices: Sequence[Any], weights: Sequence[Any]) -> Any:
+    # matrix first: an exact scalar does not know how to multiply an array, an array knows both ways
+    terms = [A * w for A, w in zip(matrices, weights, strict=True)]
+    return sum(terms[1:], terms[0])
 
 
 class Group(NamedTuple):

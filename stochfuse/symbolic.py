@@ -277,7 +277,7 @@ def _number(name: str, value: Any, symbol: sympy.Symbol) -> sympy.Expr:
         return symbol
     try:
         number = sympy.Rational(str(value))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, ZeroDivisionError):
         raise UsageError(f"{name}: expected a number, got '{value}'") from None
     if not number.is_finite or number < 0:
         raise UsageError(f"{name}: expected a number of at least 0, got {value}")
