@@ -61,7 +61,7 @@ def to_text(table: Table, width: int | None = 80) -> str:
         for row in table.rows:
             rich.add_row(*(row[index] for index in columns))
         console.print(rich)
-    return "\n".join(line.rstrip() for line in output.getvalue().rstrip("\n").split("\n")) + "\n"
+    return "\n".join(line.rstrip() for line in output.getvalue().split("\n")).rstrip("\n") + "\n"
 
 
 def _numeric(cell: str) -> bool:

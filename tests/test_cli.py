@@ -1,0 +1,335 @@
+"""The command line, as a user meets it."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sympy
+
+import stochfuse as sf
+
+ENV = {key: value for key, value in os.environ.items() if key not in ("COLUMNS", "FORCE_COLOR")}
+
+
+def run(*arguments, code=0, env=None, **options):
+    done = subprocess.run(
+        [sys.executable, "-m", "stochfuse", *arguments], capture_output=True, text=True, env={**ENV, **(env or {})}, **options
+    )
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+    return done
+
+
+def strict_json(text):
+    def refuse(constant):
+        raise AssertionError(f"{constant} is not JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_version_and_help():
+    assert run("--version").stdout == f"stochfuse {sf.__version__}\n"
+    overview = run("--help").stdout
+    for command in ("predict", "derive", "scenario"):
+        assert command in overview
+    for command in (["predict"], ["derive"], ["scenario"], ["scenario", "new"]):
+        assert "Usage: stochfuse" in run(*command, "--help").stdout
+
+
+def test_default_table_says_what_it_shows():
+    out = run("predict").stdout
+    assert out == (
+        "Expected claimed posterior covariance: variance of x [no unit given]\n"
+        "thesis-transient: 3 agents, ad-hoc; every agent alike\n"
+        "simplified formulation (54); approximate (mean field)\n"
+        "\n"
+        "    µ      k=1      k=2      k=3      k=4      k=5\n"
+        " ─────────────────────────────────────────────────\n"
+        "    0   100.00   55.556   44.615   41.043   39.775\n"
+        " 0.25   77.083   42.571   34.853   32.616   31.920\n"
+        "  0.5   58.333   32.941   27.881   26.609   26.271\n"
+        " 0.75   43.750   26.029   22.924   22.259   22.112\n"
+        "    1   33.333   21.212   19.365   19.033   18.972\n"
+    )
+
+
+def test_json_is_the_contract():
+    result = strict_json(run("predict", "--format", "json", "--link", "0:1:0.5", "--steps", "2").stdout)
+    assert list(result)[:9] == ["schema", "version", "method", "quantity", "metric", "link", "steps", "values", "scenario"]
+    assert result["schema"] == "stochfuse.prediction/1"
+    assert (result["method"], result["quantity"], result["metric"]) == ("simplified", "claimed", "trace")
+    assert result["link"] == [0.0, 0.5, 1.0]
+    assert result["steps"] == [1, 2]
+    np.testing.assert_allclose(result["values"], [[100, 55.5556], [58.3333, 32.9410], [33.3333, 21.2121]], rtol=1e-5)
+    assert result["scenario"]["network"]["steps"] == 2
+    assert result["meta"]["nature"] == "approximate"
+    again = sf.Scenario.from_mapping(result["scenario"])
+    np.testing.assert_array_equal(sf.predict(again, result["link"]).values(), result["values"])
+
+
+def test_fcs_demo_is_readable_at_80_columns_and_complete():
+    done = run("predict", "fcs-demo", "--steady")
+    lines = done.stdout.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert "RMS of x, y (root of the summed variances) [m]" in done.stdout.replace("\n", " ")
+    p = sf.predict(sf.load_scenario("fcs-demo"), steady=True)
+    assert p.steady_values("rms:x,y") is not None
+    for value in [*p.values("rms:x,y").ravel(), *p.steady_values("rms:x,y")]:
+        assert f"{value:#.5g}" in done.stdout
+    assert done.stdout.count("network minimum") == len([line for line in lines if "k=" in line])
+    assert "masked network" in done.stderr
+    assert "note: the steady state is proved to lie within a relative 1e-12" in done.stderr
+
+
+@pytest.mark.parametrize("columns", ["40", "80", "200"])
+def test_any_terminal_width(columns):
+    out = run("predict", "cv-2d", "--steps", "30", env={"COLUMNS": columns}).stdout
+    assert max(map(len, out.splitlines())) <= int(columns)
+    assert "…" not in out
+    for k in range(1, 31):
+        assert f"k={k}" in out.split()
+
+
+def test_csv_markdown_and_latex():
+    rows = list(csv.DictReader(io.StringIO(run("predict", "cv-2d", "-f", "csv", "--steps", "2", "--link", "0,1", "--steady").stdout)))
+    assert [row["step"] for row in rows] == ["1", "2", "steady"] * 2
+    assert rows[0] | {"value": ""} == {
+        "method": "simplified", "quantity": "claimed", "stage": "posterior", "nature": "approximate", "metric": "rms:x,y",
+        "unit": "m", "agent": "mean", "case": "", "link": "0.0", "step": "1", "value": "",
+    }  # fmt: skip
+    assert float(rows[0]["value"]) == pytest.approx(200**0.5, rel=1e-15)
+    markdown = run("predict", "-f", "markdown", "--link", "0.5").stdout
+    assert "| µ | k=1 | k=2 | k=3 | k=4 | k=5 |\n| :-- | --: | --: | --: | --: | --: |\n| 0.5 | 58.333 |" in markdown
+    latex = run("predict", "cv-2d", "-f", "latex", "--link", "0.5", "--metric", "det").stdout
+    assert latex.startswith("\\begin{table}\n  \\caption{Expected claimed posterior covariance: determinant over x, vx, y, vy")
+    assert r"m$^2$ (m/s)$^2$" in latex
+
+
+@pytest.mark.parametrize(
+    ("metric", "function"),
+    [
+        ("trace", np.trace),
+        ("det", np.linalg.det),
+        ("max-eig", lambda P: np.linalg.eigvalsh(P)[-1]),
+        ("var:vx", lambda P: P[1, 1]),
+        ("std:y", lambda P: P[2, 2] ** 0.5),
+        ("rms:x,y", lambda P: (P[0, 0] + P[2, 2]) ** 0.5),
+    ],
+)
+def test_metrics(metric, function):
+    done = run("predict", "cv-2d", "--metric", metric, "-f", "json", "--link", "0.3", "--steps", "3")
+    P = sf.predict(sf.load_scenario("cv-2d", steps=3), [0.3]).covariance[0]
+    result = strict_json(done.stdout)
+    assert result["metric"] == metric
+    np.testing.assert_allclose(result["values"][0], [function(P_k) for P_k in P], rtol=1e-12)
+    assert ("adds up different units" in done.stderr) == (metric in ("trace", "max-eig"))
+
+
+def test_normalised_to_no_link():
+    result = strict_json(run("predict", "-f", "json", "--normalise", "--steady").stdout)
+    assert result["values"][0] == [1.0] * 5
+    assert result["steady"][0] == pytest.approx(1.0)
+    assert result["values"][-1][0] == pytest.approx(1 / 3)
+    assert result["meta"]["normalised"] == "to link probability 0"
+
+
+def test_agents_that_differ():
+    values = {
+        a: np.array(strict_json(run("predict", "fcs-demo", "-f", "json", "--agent", a).stdout)["values"])
+        for a in ("mean", "worst", "best", "1", "10")
+    }
+    assert (values["worst"] >= values["mean"] * (1 - 1e-12)).all()
+    assert (values["mean"] >= values["best"] * (1 - 1e-12)).all()
+    np.testing.assert_array_equal(values["worst"], np.maximum(values["1"], values["10"]))
+
+
+def test_scenario_from_standard_input_file_and_json(tmp_path):
+    text = run("scenario", "show", "cv-2d").stdout
+    (tmp_path / "mine.toml").write_text(text)
+    from_file = run("predict", str(tmp_path / "mine.toml"), "-f", "csv").stdout
+    from_stdin = run("predict", "-", "-f", "csv", input=text).stdout
+    from_json = run("predict", "-", "-f", "csv", input=run("scenario", "show", "cv-2d", "--json").stdout).stdout
+    assert from_file == from_stdin == from_json == run("predict", "cv-2d", "-f", "csv").stdout
+
+
+def test_scenario_commands(tmp_path):
+    listing = strict_json(run("scenario", "list", "-f", "json").stdout)
+    assert [entry["name"] for entry in listing] == ["cv-2d", "fcs-demo", "thesis-steady", "thesis-transient"]
+    assert "fcs-demo" in run("scenario", "list").stdout
+    assert run("scenario", "check", "fcs-demo").stdout == "fcs-demo: ok: 10 agents, ad-hoc, 10 steps, state (x, vx, y, vy)\n"
+    schema = strict_json(run("scenario", "schema").stdout)
+    assert set(schema["properties"]) == {"schema", "description", "model", "initial", "network", "agent", "report"}
+    new = tmp_path / "new.toml"
+    run("scenario", "new", "--output", str(new))
+    assert "ok: 3 agents" in run("scenario", "check", str(new)).stdout
+    assert "new.toml exists already" in run("scenario", "new", "--output", str(new), code=2).stderr
+    assert "no preset 'nothing'; the presets are cv-2d" in run("scenario", "new", "nothing", code=2).stderr
+
+
+def test_derive_agrees_with_predict(tmp_path):
+    text = run("derive", "simplified", "--agents", "3", "--step", "4", "--q", "25", "--r", "100", "--p0", "100").stdout
+    lines = dict(line.split(" = ", 1) for line in text.splitlines() if line.startswith("P_4 = (") )
+    closed = sympy.sympify(lines["P_4"])
+    expected = sf.predict(sf.load_scenario(), [0.25]).values()[0, 3]
+    assert float(closed.subs("mu", sympy.Rational(1, 4))) == pytest.approx(expected, rel=1e-14)
+    names = [f["key"] for f in strict_json(run("derive", "simplified", "--agents", "3", "--step", "2", "-f", "json").stdout)["formulas"]]
+    assert names == ["P_1", "P_2_prior", "P_2", "closed", "derivative", "series_at_0", "series_at_1", "fixed_point", "fixed_point_polynomial"]
+    latex = run("derive", "--latex", "--agents", "2").stdout
+    assert latex.count(r"\begin{equation*}") == latex.count(r"\end{equation*}") == 9
+    assert r"\frac{\mathrm{d}P(2)}{\mathrm{d}\mu} = " in latex
+    assert "P(2|1) = P(1) + q" in latex
+    long = run("derive", "--step", "7", "--output", str(tmp_path / "chain.txt"))
+    assert "note: step 7 is given as a chain of named sub-expressions" in long.stderr
+    assert long.stdout == ""
+    assert "P_7_prior = P_6 + q" in (tmp_path / "chain.txt").read_text()
+
+
+@pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])
+def test_plots(tmp_path, suffix):
+    file = tmp_path / f"figure.{suffix}"
+    run("predict", "fcs-demo" if suffix == "png" else "thesis-steady", "--plot", str(file))
+    start = {"png": b"\x89PNG", "svg": b"<?xml", "pdf": b"%PDF"}[suffix]
+    assert file.read_bytes().startswith(start)
+    assert [f.name for f in tmp_path.iterdir()] == [file.name]
+
+
+@pytest.mark.parametrize(("name", "format"), [("a.csv", "csv"), ("a.json", "json"), ("a.md", "markdown"), ("a.tex", "latex"), ("a.txt", "table")])
+def test_output_goes_to_a_file_in_the_format_of_its_name(tmp_path, name, format):
+    done = run("predict", "--output", str(tmp_path / name))
+    assert done.stdout == ""
+    assert (tmp_path / name).read_text() == run("predict", "--format", format).stdout
+
+
+BAD = [
+    (["predict", "nothing.toml"], "error: nothing.toml: no such file, and no preset of that name"),
+    (["predict", "--link", "1.5"], "error: --link: expected probabilities between 0 and 1, got 1.5"),
+    (["predict", "--link", "a"], "error: --link: expected 0.5, 0.2,0.5 or 0:1:0.25, got 'a'"),
+    (["predict", "--link", "0:1"], "error: --link: expected 0.5, 0.2,0.5 or 0:1:0.25, got '0:1'"),
+    (["predict", "--link", "0:1:-1"], "error: --link: expected first:last:step with"),
+    (["predict", "--link", "0:1:1e-12"], "error: --link: expected at most 1000000 link probabilities"),
+    (["predict", "--link", "nan"], "error: --link: expected probabilities between 0 and 1, got nan"),
+    (["predict", "--agents", "0"], "Invalid value for '--agents'"),
+    (["predict", "--agents", "many"], "Invalid value for '--agents'"),
+    (["predict", "--r", "-1"], "model.R: expected a symmetric positive definite matrix, got a variance of -1"),
+    (["predict", "--q", "nan"], "model.Q: expected a number or a 1×1 matrix"),
+    (["predict", "--architecture", "star"], "Invalid value for '--architecture'"),
+    (["predict", "--method", "guess"], "Invalid value for '--method'"),
+    (["predict", "--metric", "size"], "error: metric: expected trace, det, max-eig, var:STATE, std:STATE or rms:STATE,STATE,…, got 'size'"),
+    (["predict", "--metric", "var:y"], "error: metric 'var:y': no state 'y'; the states are x"),
+    (["predict", "cv-2d", "--metric", "var:x,y"], "expected one state, got 2; use rms: for several"),
+    (["predict", "fcs-demo", "--agent", "11"], "error: agent: expected mean, worst, best or a number from 1 to 10, got '11'"),
+    (["predict", "fcs-demo", "--agent", "some"], "error: agent: expected mean, worst, best or a number from 1 to 10, got 'some'"),
+    (["predict", "--output", "/nowhere/x.csv"], "error: cannot write /nowhere/x.csv: there is no directory /nowhere"),
+    (["predict", "--output", "/tmp"], "error: cannot write /tmp: it is a directory"),
+    (["predict", "--plot", "x.bmp"], "error: x.bmp: expected a name that ends in .png, .svg, .pdf"),
+    (["derive", "--q", "abc"], "error: q: expected a number, got 'abc'"),
+    (["derive", "general"], "Invalid value for"),
+    (["scenario", "check", "nothing.toml"], "no such file"),
+    (["nonsense"], "No such command 'nonsense'"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), BAD, ids=[" ".join(b[0]) for b in BAD])
+def test_wrong_usage_exits_2_with_a_message_and_no_output(arguments, message, tmp_path):
+    done = run(*arguments, code=2, cwd=tmp_path)
+    assert done.stdout == ""
+    assert message in " ".join(done.stderr.split())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_bad_file_names_every_key_and_leaves_no_output(tmp_path):
+    (tmp_path / "bad.toml").write_text("[model]\nF = 1\nH = 1\nQ = -1\nR = 0\n[initial]\nP = nan\n[network]\nagents = 3\nsteps = 2\nlink = 7\n")
+    done = run("predict", "bad.toml", "--output", "out.csv", code=2, cwd=tmp_path)
+    for key in ("model.Q", "model.R", "initial.P", "network.link"):
+        assert f"\n  {key}: expected " in done.stderr
+    assert not (tmp_path / "out.csv").exists()
+
+
+def test_no_steady_state_exits_3(tmp_path):
+    file = tmp_path / "drift.toml"
+    file.write_text("[model]\nF = 2\nH = 0\nQ = 1\nR = 1\n[initial]\nP = 1\n[network]\nagents = 2\nsteps = 2\n")
+    done = run("predict", str(file), "--steady", code=3)
+    assert done.stderr.startswith("no answer: no steady state: the stand-alone filter does not converge")
+    assert done.stdout == ""
+
+
+def test_a_covariance_beyond_floating_point_is_a_failure_not_a_nan(tmp_path):
+    file = tmp_path / "drift.toml"
+    file.write_text("[model]\nF = 2\nH = 0\nQ = 1\nR = 1\n[initial]\nP = 1\n[network]\nagents = 2\nsteps = 600\n")
+    done = run("predict", str(file), "--format", "json", code=1)
+    assert "error: the prediction is not finite: the covariance grows beyond floating point" in done.stderr
+    assert done.stdout == ""
+
+
+@pytest.mark.skipif(os.geteuid() == 0 and not Path("/proc/self/mem").exists(), reason="root may write anywhere")
+def test_an_unwritable_output_is_said_without_traceback(tmp_path):
+    done = run("predict", "--output", "/proc/self/nothing.csv", code=2)
+    assert "error: cannot write /proc/self/nothing.csv: " in done.stderr
+
+
+def test_an_existing_file_survives_a_failure(tmp_path):
+    target = tmp_path / "kept.csv"
+    target.write_text("precious")
+    run("predict", "--link", "2", "--output", str(target), code=2)
+    assert target.read_text() == "precious"
+    run("predict", "--output", str(target))
+    assert target.read_text().startswith("method,")
+
+
+def test_a_closed_pipe_is_quiet():
+    command = f"{sys.executable} -m stochfuse predict --link 0:1:0.0001 --format csv | head -1"
+    done = subprocess.run(["bash", "-o", "pipefail", "-c", command], capture_output=True, text=True, env=ENV)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("method,")
+
+
+@pytest.mark.parametrize("delay", [0.05, 0.3, 0.8])
+def test_ctrl_c_is_quiet(delay):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "stochfuse", "predict", "cv-2d", "--agents", "500", "--link", "0:1:0.0001", "--steps", "5000"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ENV,
+    )  # fmt: skip
+    time.sleep(delay)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=30)
+    if delay < 0.2:  # Python itself may still be starting
+        return
+    assert process.returncode == 130
+    assert "Traceback" not in errors
+
+
+def test_completion_knows_commands_and_presets():
+    env = {"_STOCHFUSE_COMPLETE": "complete_bash", "COMP_WORDS": "stochfuse predict fcs", "COMP_CWORD": "2"}
+    assert "fcs-demo" in run(env=env).stdout
+
+
+def test_no_command_imports_what_it_does_not_need():
+    def imported(*arguments):
+        code = f"import sys; sys.argv = ['stochfuse', *{arguments!r}]\ntry:\n    import stochfuse.cli; stochfuse.cli.main()\nexcept SystemExit: pass\nprint(*sys.modules, file=sys.stderr)"
+        return set(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=ENV).stderr.split())
+
+    for arguments in (["--help"], ["--version"]):
+        assert not imported(*arguments) & {"numpy", "scipy", "sympy", "matplotlib", "pydantic"}
+    # some versions of Typer import pydantic themselves; ours is the schema's
+    assert not imported("predict") & {"scipy", "sympy", "matplotlib", "stochfuse.schema"}
+    assert "scipy" not in imported("derive")
+
+
+def test_import_of_the_package_is_light():
+    code = "import sys, stochfuse; print(*sys.modules)"
+    modules = set(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.split())
+    assert not modules & {"numpy", "scipy", "sympy", "pydantic"}
+    for name in sf.__all__:
+        assert getattr(sf, name) is not None
+    with pytest.raises(AttributeError, match="module 'stochfuse' has no attribute 'nothing'"):
+        _ = sf.nothing  # type: ignore[attr-defined]
