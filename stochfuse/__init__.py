@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from stochfuse.errors import StochfuseError as StochfuseError
     from stochfuse.errors import UsageError as UsageError
     from stochfuse.methods import predict as predict
-    from stochfuse.questions import steady_state as steady_state
     from stochfuse.prediction import Prediction as Prediction
+    from stochfuse.questions import steady_state as steady_state
     from stochfuse.scenario import Scenario as Scenario
     from stochfuse.scenario import load_scenario as load_scenario
     from stochfuse.states import predict_states as predict_states
@@ -43,7 +43,20 @@ _HOME = {
     "steady_state": "questions",
 }
 
-__all__ = ["__version__", *sorted(_HOME)]
+__all__ = [
+    "NoAnswerError",
+    "Prediction",
+    "Scenario",
+    "ScenarioError",
+    "StochfuseError",
+    "UsageError",
+    "__version__",
+    "derive_simplified",
+    "load_scenario",
+    "predict",
+    "predict_states",
+    "steady_state",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -63,9 +63,7 @@ def update_scalar(stacked: np.ndarray, J: float, arrivals: Arrivals) -> np.ndarr
     return prior * arrivals.remaining(prior * J)
 
 
-def update_measurement_space(
-    stacked: np.ndarray, d: int, p: int, arrivals: Arrivals
-) -> tuple[np.ndarray, np.ndarray]:
+def update_measurement_space(stacked: np.ndarray, d: int, p: int, arrivals: Arrivals) -> tuple[np.ndarray, np.ndarray]:
     """Average the update in measurement space.
 
     Parameters

@@ -65,8 +65,8 @@ class Checker:
     ) -> np.ndarray | None:
         """Read a matrix, constant (2 axes) or per step (3 axes, at least `steps` entries).
 
-        Where rows or columns are None they may be any number, and steps = 0 takes constants only; a number is 1×1, or that multiple of the identity
-        if `identity` is set.
+        Where rows or columns are None they may be any number, and steps = 0 takes constants only; a number is 1×1, or
+        that multiple of the identity if `identity` is set.
         """
         shape = f"{rows or ''}{'×' if rows and columns else ''}{columns or ''}"
         kind = "matrix" if not shape else f"{shape} matrix" if rows and columns else f"matrix with {shape} "
@@ -118,7 +118,7 @@ class Checker:
         return array
 
     def vector(self, path: str, value: Any, n: int | None, steps: int | None = None) -> np.ndarray | None:
-        """Read a vector as a column (n, 1), or per step (steps, n, 1) if `steps` is given; a number is a vector of one."""
+        """Read a vector as a column (n, 1), or per step (steps, n, 1) if `steps` is given; a number has one entry."""
         shape = "a number or a list of numbers" if n is None else "a number" if n == 1 else f"a list of {n} numbers"
         expected = shape + (", or one such list per step" if steps else "")
         array = self.array(path, value, expected)
@@ -166,7 +166,9 @@ class Checker:
         if isinstance(value, list | tuple | np.ndarray) and len(value):
             depths = [np.ndim(entry) if not isinstance(entry, list | tuple) else _depth(entry) for entry in value]
             if set(depths) == {0, 2}:
-                value = [np.full((agents, agents), e) if depth == 0 else e for e, depth in zip(value, depths, strict=True)]
+                value = [
+                    np.full((agents, agents), e) if depth == 0 else e for e, depth in zip(value, depths, strict=True)
+                ]
         array = self.array(path, value, expected)
         if array is None:
             return None

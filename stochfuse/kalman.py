@@ -164,7 +164,7 @@ def factor(P: np.ndarray) -> np.ndarray:
 
 
 def join_factors(*blocks: np.ndarray) -> np.ndarray:
-    """Square factor, shape (..., d, d), of Σ B Bᵀ over blocks B of shape (..., d, any): a QR decomposition, no squaring."""
+    """Square factor, shape (..., d, d), of Σ B Bᵀ over blocks B of shape (..., d, any), by QR: nothing is squared."""
     batch = np.broadcast_shapes(*(block.shape[:-2] for block in blocks))
     stacked = np.concatenate([np.broadcast_to(b, batch + b.shape[-2:]) for b in blocks], axis=-1)
     d, columns = stacked.shape[-2:]
@@ -199,8 +199,8 @@ def update_factor(
     left = np.ones((*sigma.shape[:-1], L.shape[-1]))
     left[..., :k] = np.sqrt(shrink(sigma**2))
     posterior = L @ V * left[..., None, :]
-    # V is orthogonal to rounding only, which in a direction measured with σ = 1e8 is an error of σ·1e-16: the posterior must
-    # show the sensor exactly UΣ√shrink, and what differs is taken out along the measured directions
+    # V is orthogonal to rounding only, which in a direction measured with σ = 1e8 is an error of σ·1e-16: the posterior
+    # must show the sensor exactly UΣ√shrink, and what differs is taken out along the measured directions
     shown = np.zeros((*sigma.shape[:-1], H.shape[-2], L.shape[-1]))
     shown[..., :k] = U * (sigma * left[..., :k])[..., None, :]
     strong = sigma > 1e-3 * np.maximum(sigma[..., :1], 1e3)

@@ -92,5 +92,9 @@ def _rows(scenario: Scenario, link: Any) -> LinkRows:
         if not check.problems:
             return LinkRows(None, tuple(m for m in matrices if m is not None))
     elif array is not None:
-        check.note("link", f"link probabilities, or one {network.agents}×{network.agents} matrix of them per row", f"an array of shape {array.shape}")
+        check.note(
+            "link",
+            f"link probabilities, or one {network.agents}×{network.agents} matrix of them per row",
+            f"an array of shape {array.shape}",
+        )
     raise UsageError("; ".join(map(str, check.problems)))

@@ -1,7 +1,7 @@
 """One number out of a covariance: trace, determinant, largest eigenvalue, one state, RMS of a sub-block.
 
-A metric is named as the command line takes it: `trace`, `det`, `max-eig`, `var:x`, `std:x` or `rms:x,y` (the root of the
-sum of the named states' variances), with the states' own names.
+A metric is named as the command line takes it: `trace`, `det`, `max-eig`, `var:x`, `std:x` or `rms:x,y` (the root
+of the sum of the named states' variances), with the states' own names.
 """
 
 from __future__ import annotations

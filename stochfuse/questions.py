@@ -1,13 +1,13 @@
 """Questions about the recursion as a whole: the steady state.
 
 The steady state of the simplified formulation solves P = g_µ(P) with g_µ(P) = Σ β(m) update(F P Fᵀ + Q, R/(m+1)), a
-modified algebraic Riccati equation.  g_µ is monotone and concave in P; where the stand-alone filter converges it has one
-fixed point.  The recursion is run for a while and then finished by Newton's method, with the derivative of g_µ taken by
-central differences over a basis of the symmetric matrices (one batched call).
+modified algebraic Riccati equation.  g_µ is monotone and concave in P; where the stand-alone filter converges it has
+one fixed point.  The recursion is run for a while and then finished by Newton's method, the derivative of g_µ taken
+by central differences over a basis of the symmetric matrices (one batched call).
 
 The answer carries its own proof.  By monotonicity, g(P₋) ≥ P₋ puts the fixed point above P₋ and g(P₊) ≤ P₊ below P₊, in
-the positive-definite order; P₋ = (1−ε)P and P₊ = (1+ε)P are tried for ε = 1e-12, 1e-11, … and the first ε that brackets is
-reported as the relative bound.
+the positive-definite order; P₋ = (1−ε)P and P₊ = (1+ε)P are tried for ε = 1e-12, 1e-11, … and the first ε that brackets
+is reported as the relative bound.
 """
 
 from __future__ import annotations
@@ -70,9 +70,15 @@ def steady_state(scenario: Scenario, link: Sequence[float] | LinkRows | None = N
     NoAnswerError
         If the stand-alone filter diverges: an unstable mode is not observed.
     """
-    rows = link if isinstance(link, LinkRows) else default_rows(scenario.network) if link is None else uniform_rows(link)
+    rows = (
+        link if isinstance(link, LinkRows) else default_rows(scenario.network) if link is None else uniform_rows(link)
+    )
     sensors = scenario.sensors
-    if scenario.model.varies or any(s.H.ndim + s.R.ndim > 4 for s in sensors) or any(a.ndim in (1, 3) for a in rows.arrays):
+    if (
+        scenario.model.varies
+        or any(s.H.ndim + s.R.ndim > 4 for s in sensors)
+        or any(a.ndim in (1, 3) for a in rows.arrays)
+    ):
         raise UsageError("a steady state needs a model, sensors and links that do not vary with the step")
     brief = replace(scenario, network=replace(scenario.network, steps=2))
     parts, group_of, first = [], np.zeros(scenario.network.agents, dtype=int), 0

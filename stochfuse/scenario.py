@@ -148,7 +148,9 @@ def parse(name: str, text: str) -> dict[str, Any]:
     except RecursionError:
         raise ScenarioError(name, "nested too deeply") from None
     except ValueError as error:
-        raise ScenarioError(name, f"not valid {'JSON' if 'json' in type(error).__module__ else 'TOML'}: {error}") from None
+        raise ScenarioError(
+            name, f"not valid {'JSON' if 'json' in type(error).__module__ else 'TOML'}: {error}"
+        ) from None
     if not mapping:
         raise ScenarioError(name, "empty; see `stochfuse scenario new`")
     return mapping
@@ -181,7 +183,9 @@ def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> S
     if not isinstance(mapping, Mapping):
         raise ScenarioError(name, structure)
     check = Checker(skip={problem.path for problem in structure})
-    tables = {key: mapping[key] if isinstance(mapping.get(key), dict) else {} for key in ("model", "initial", "network")}
+    tables = {
+        key: mapping[key] if isinstance(mapping.get(key), dict) else {} for key in ("model", "initial", "network")
+    }
     network = _network(check, tables["network"])
     steps = network.steps if network else 1
     model, default = _model(check, tables["model"], steps)
@@ -241,7 +245,9 @@ def _link(check: Checker, path: str, value: Any, agents: int, steps: int, archit
         with np.errstate(invalid="ignore"):
             uneven = agents > 2 and (np.nanmax(others, axis=-2) != np.nanmin(others, axis=-2)).any()
         if uneven:
-            check.note(path, "equal probabilities in each column (a broadcast is heard by all or by none)", "unequal ones")
+            check.note(
+                path, "equal probabilities in each column (a broadcast is heard by all or by none)", "unequal ones"
+            )
     return link
 
 
@@ -251,7 +257,9 @@ def _delay(check: Checker, value: Any) -> tuple[float, ...]:
         return (1.0,)
     if array.ndim == 0:
         if array < 0 or array != int(array):
-            check.note("network.delay", "a whole number of steps, or the probabilities of 0, 1, 2 … steps", shown(value))
+            check.note(
+                "network.delay", "a whole number of steps, or the probabilities of 0, 1, 2 … steps", shown(value)
+            )
             return (1.0,)
         return (0.0,) * int(array) + (1.0,)
     if array.ndim != 1 or not array.size or (array < 0).any() or abs(array.sum() - 1) > 1e-9:

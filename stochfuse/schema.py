@@ -144,7 +144,7 @@ def structure_problems(mapping: Any) -> list[Problem]:
 def _problem(entry: Any) -> Problem:
     location = list(entry["loc"])
     for place, part in enumerate(location):
-        if part in _SHAPE_OF and place < len(location) - 1 or (part in _SHAPE_OF and entry["type"].endswith("_type")):
+        if (part in _SHAPE_OF and place < len(location) - 1) or (part in _SHAPE_OF and entry["type"].endswith("_type")):
             # a union reports one error per alternative: say once what the key takes
             return Problem(_path(location[: place + 1]), _SHAPES[_SHAPE_OF[part]], _got(entry, location[place + 1 :]))
     kind, context = entry["type"], entry.get("ctx", {})

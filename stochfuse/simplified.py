@@ -10,8 +10,8 @@ where P(k|k−1) is predicted from the *averaged* P(k−1).  Since P⁻¹(k|k) =
 
     P_m = update(P(k|k−1), R/(m+1)):
 
-m arrivals make one Kalman update with m + 1 measurements.  `outcome` is that form, `outcome_as_printed` the literal one;
-the symbolic tests prove them equal.  At step 1 independent initial estimates share nothing, and P_m = P(k0)/(m+1);
+m arrivals make one Kalman update with m + 1 measurements.  `outcome` is that form, `outcome_as_printed` the literal
+one; the symbolic tests prove them equal.  At step 1 independent initial estimates share nothing, and P_m = P(k0)/(m+1);
 a shared initial estimate stays what it is.
 
 Departures from the source
@@ -51,7 +51,7 @@ def outcome(prior: Estimate, H: Any, R: Any, m: int, z: Any = None, *, algebra: 
 
 
 def outcome_by_information(prior: Estimate, H: Any, R: Any, m: int, *, algebra: Algebra = NUMPY) -> Estimate:
-    """P_m in information form, [P⁻¹(k|k−1) + (m+1) HᵀR⁻¹H]⁻¹: the shortest for symbols; the prior must be invertible."""
+    """P_m in information form, [P⁻¹(k|k−1) + (m+1) HᵀR⁻¹H]⁻¹, the shortest for symbols; needs an invertible prior."""
     information = update_information(to_information(prior, algebra=algebra), H, R / (m + 1), algebra=algebra)
     return from_information(information, algebra=algebra)
 
@@ -149,7 +149,10 @@ def departures(scenario: Scenario, rows: LinkRows) -> list[str]:
             "derivation, evaluated with the one possible sender of each agent"
         )
     if not rows.uniform:
-        masked = any(((m := rows.matrices(network, k)) == 0).any() and (m > 0).any() for k in _distinct_steps(rows, network.steps))
+        masked = any(
+            ((m := rows.matrices(network, k)) == 0).any() and (m > 0).any()
+            for k in _distinct_steps(rows, network.steps)
+        )
         if masked:
             notes.append(
                 "some links have probability 0: on a masked network (54) is an approximation outside its derivation, "
@@ -180,7 +183,12 @@ def groups(scenario: Scenario, rows: LinkRows) -> list[Group]:
 
 
 def _group(
-    scenario: Scenario, shared: bool, agents: np.ndarray, own: int, sender_kinds: np.ndarray, matrices: dict[int, np.ndarray]
+    scenario: Scenario,
+    shared: bool,
+    agents: np.ndarray,
+    own: int,
+    sender_kinds: np.ndarray,
+    matrices: dict[int, np.ndarray],
 ) -> Group:
     """Agents with one kind of sensor, those that hear others with the same probabilities taken together."""
     kinds_here = sender_kinds[agents]
@@ -195,7 +203,9 @@ def _group(
                 heard = _sort_within(heard, kinds_here == kind)
             seen[id(matrix)] = heard
         by_step.append(seen[id(matrix)])
-    signature = np.concatenate([kinds_here, *(h.transpose(1, 0, 2).reshape(len(agents), -1) for h in seen.values())], axis=1)
+    signature = np.concatenate(
+        [kinds_here, *(h.transpose(1, 0, 2).reshape(len(agents), -1) for h in seen.values())], axis=1
+    )
     _, first, column_of = np.unique(signature, axis=0, return_index=True, return_inverse=True)
     members = tuple(tuple(agents[column_of.ravel() == c].tolist()) for c in range(len(first)))
     if len(scenario.sensors) == 1:
@@ -210,7 +220,9 @@ def _sort_within(heard: np.ndarray, mask: np.ndarray) -> np.ndarray:
     filled = np.where(mask, heard, np.inf)
     ranks = np.sort(filled, axis=-1)
     places = np.cumsum(mask, axis=-1) - 1
-    return np.where(mask, np.take_along_axis(ranks, np.broadcast_to(np.maximum(places, 0), heard.shape), axis=-1), heard)
+    return np.where(
+        mask, np.take_along_axis(ranks, np.broadcast_to(np.maximum(places, 0), heard.shape), axis=-1), heard
+    )
 
 
 def _items(table: np.ndarray) -> np.ndarray:

@@ -5,8 +5,8 @@ With P_m one update with m + 1 measurements, the consistent (53) is
     x̂(k) = x̂⁻ + K̄ (z − H x̂⁻),    K̄ = Σ β(m) K_m,   K_m = P⁻Hᵀ(H P⁻Hᵀ + R/(m+1))⁻¹
 
 for one record z(k) that stands for what every agent measured, as (53) has it.  Agents with records of their own average
-over the sets S of senders, x̂_i(k) = Σ_S µ_S µ_¬S update(prior_i; z_i and z_j, j ∈ S), with agent i's prior in the place of
-the common one.  The printed (53) puts the averaged P(k) in front of the sum; its bias is erratum 1 (see
+over the sets S of senders, x̂_i(k) = Σ_S µ_S µ_¬S update(prior_i; z_i and z_j, j ∈ S), with agent i's prior in the place
+of the common one.  The printed (53) puts the averaged P(k) in front of the sum; its bias is erratum 1 (see
 `stochfuse.simplified`).
 """
 
@@ -74,7 +74,9 @@ def predict_states(
     z = np.asarray(measurements, dtype=float)
     steps, n = scenario.network.steps, scenario.network.agents
     widths = {sensor.H.shape[-2] for sensor in scenario.sensors}
-    expected = f"(steps, p) or (steps, agents, p) with {steps} steps, {n} agents and p = {', '.join(map(str, sorted(widths)))}"
+    expected = (
+        f"(steps, p) or (steps, agents, p) with {steps} steps, {n} agents and p = {', '.join(map(str, sorted(widths)))}"
+    )
     if len(widths) > 1 or z.ndim not in (2, 3) or len(z) < steps or z.shape[-1] not in widths:
         raise UsageError(f"measurements: expected shape {expected}, got {z.shape}")
     if z.ndim == 3 and z.shape[1] != n:
@@ -151,7 +153,12 @@ def _own_records(scenario: Scenario, rows: LinkRows, z: np.ndarray) -> np.ndarra
         sensors = [_sensor(scenario.sensors[kind], step) for kind in scenario.sensor_of]
         x = [
             _over_subsets(
-                _prior(scenario, x[i], P[:, step - 2, group_of[i]], step), i, senders[i], heard[:, i], sensors, z[step - 1]
+                _prior(scenario, x[i], P[:, step - 2, group_of[i]], step),
+                i,
+                senders[i],
+                heard[:, i],
+                sensors,
+                z[step - 1],
             )
             for i in range(network.agents)
         ]

@@ -3,8 +3,8 @@
 For n like agents with a scalar state (F = G = H = 1) and a link probability µ.  Closed forms come from polynomial
 arithmetic, never from `simplify`:
 
-* numerator and denominator are carried apart in one of SymPy's polynomial rings (`Ratio`): with symbols they stay coprime
-  by themselves, and a gcd at every step would cost everything; with numbers one gcd at the end is cheap;
+* numerator and denominator are carried apart in one of SymPy's polynomial rings (`Ratio`): with symbols they stay
+  coprime by themselves, and a gcd at every step would cost everything; with numbers one gcd at the end is cheap;
 * where the expanded form would fill pages, a chain of named sub-expressions takes its place, which is also the right
   thing to `lambdify`.
 """
@@ -47,7 +47,8 @@ class Ratio:
         if self.denominator == other.denominator:
             return Ratio(self.numerator + other.numerator, self.denominator)
         return Ratio(
-            self.numerator * other.denominator + other.numerator * self.denominator, self.denominator * other.denominator
+            self.numerator * other.denominator + other.numerator * self.denominator,
+            self.denominator * other.denominator,
         )
 
     def __rsub__(self, other: int) -> Ratio:
@@ -69,7 +70,9 @@ class Ratio:
         return Ratio(self.numerator**exponent, self.denominator**exponent)
 
 
-def recursion(agents: int, steps: int, q: Any, r: Any, p0: Any, mu: Any, *, shared: bool, algebra: Algebra) -> list[Any]:
+def recursion(
+    agents: int, steps: int, q: Any, r: Any, p0: Any, mu: Any, *, shared: bool, algebra: Algebra
+) -> list[Any]:
     """P(1) … P(steps) of (54) for a scalar model, by the shared kernel.
 
     Parameters
@@ -101,9 +104,9 @@ class SimplifiedForm:
 
     agents: int
     step: int
-    q: sympy.Expr = Q
-    r: sympy.Expr = R
-    p0: sympy.Expr = P0
+    q: Any = Q
+    r: Any = R
+    p0: Any = P0
     shared: bool = False
 
     @property
@@ -129,14 +132,15 @@ class SimplifiedForm:
         if not self.expandable:
             raise UsageError(
                 f"the expanded form of step {self.step} for {self.agents} agents has a denominator of "
-                f"{self.agents ** (self.step - 1)} factors; use the chain of sub-expressions, or numbers for q, r and p0"
+                f"{self.agents ** (self.step - 1)} factors; use the chain of sub-expressions or numbers for q, r and p0"
             )
-        ring, *generators = polynomial_ring((*self.symbols, MU), sympy.QQ)
+        made: Any = polynomial_ring((*self.symbols, MU), sympy.QQ)
+        ring, generators = made[0], made[1:]
         named = dict(zip((*self.symbols, MU), generators, strict=True))
         q, r, p0 = (named[v] if v in named else ring(_rational(v)) for v in (self.q, self.r, self.p0))
-        cells = [np.array([[Ratio(v, ring.one)]], dtype=object) for v in (q, r, p0)]
+        q, r, p0 = (_cell(Ratio(v, ring.one)) for v in (q, r, p0))
         µ = Ratio(named[MU], ring.one)
-        out = recursion(self.agents, self.step, *cells, µ, shared=self.shared, algebra=FIELD)
+        out = recursion(self.agents, self.step, q, r, p0, µ, shared=self.shared, algebra=FIELD)
         return tuple(self._as_polynomials(P[0, 0]) for P in out)
 
     def closed(self, step: int | None = None) -> sympy.Expr:
@@ -173,14 +177,17 @@ class SimplifiedForm:
             coefficients.append(_reduced(value, self.symbols))
         variable = MU if at == 0 else 1 - MU
         # unevaluated, since SymPy multiplies a number into 1 − µ
-        return sympy.Add(*(sympy.Mul(c, variable**j, evaluate=False) for j, c in enumerate(coefficients)), evaluate=False)
+        return sympy.Add(
+            *(sympy.Mul(c, variable**j, evaluate=False) for j, c in enumerate(coefficients)), evaluate=False
+        )
 
     @cached_property
     def chain(self) -> tuple[tuple[sympy.Symbol, sympy.Expr], ...]:
         """Named sub-expressions: each prior P_k_prior = P(k|k−1) and each P_k = P(k), in order."""
         links: list[tuple[sympy.Symbol, sympy.Expr]] = []
         P = sympy.Symbol("P_1", positive=True)
-        first = recursion(self.agents, 1, *self._matrices(self.p0), MU, shared=self.shared, algebra=SYMPY)
+        q, r, p0 = (sympy.Matrix([[v]]) for v in (self.q, self.r, self.p0))
+        first = recursion(self.agents, 1, q, r, p0, MU, shared=self.shared, algebra=SYMPY)
         links.append((P, first[0][0, 0]))
         for k in range(2, self.step + 1):
             prior = sympy.Symbol(f"P_{k}_prior", positive=True)
@@ -189,21 +196,22 @@ class SimplifiedForm:
             links.append((P, self._mixture(prior)))
         return tuple(links)
 
-    def fixed_point(self) -> sympy.Eq:
+    def fixed_point(self) -> Any:
         """P = g_µ(P), the steady state's equation."""
         return sympy.Eq(FIXED, self._mixture(FIXED + self.q))
 
     def fixed_point_polynomial(self) -> sympy.Poly:
         """The same with the denominators cleared: a polynomial in P that vanishes at the steady state."""
         gens = (FIXED, *(s for s in (self.q, self.r) if isinstance(s, sympy.Symbol)), MU)
-        K, *elements = field(gens, sympy.QQ)
+        made: Any = field(gens, sympy.QQ)
+        K, elements = made[0], made[1:]
         named = dict(zip(gens, elements, strict=True))
         q, r = (named[s] if s in named else K(_rational(s)) for s in (self.q, self.r))
-        p = named[FIXED]
-        cell = [np.array([[e]], dtype=object) for e in (q, r, p)]
         # with p0 = P shared by all agents, the second step of the recursion is g_µ(P)
-        g = recursion(self.agents, 2, *cell, named[MU], shared=True, algebra=FIELD)[1][0, 0]
-        return sympy.Poly((g - p).numer.as_expr(), FIXED)
+        g = recursion(self.agents, 2, _cell(q), _cell(r), _cell(named[FIXED]), named[MU], shared=True, algebra=FIELD)[
+            1
+        ][0, 0]
+        return sympy.Poly((g - named[FIXED]).numer.as_expr(), FIXED)
 
     def lambdify(self) -> Callable[..., np.ndarray]:
         """Return P(step) as a NumPy function of µ and of the symbols among q, r and p0, in that order.
@@ -211,7 +219,8 @@ class SimplifiedForm:
         It evaluates the chain, never the expanded form, which loses digits and time.
         """
         *before, (_, last) = self.chain
-        return sympy.lambdify((MU, *self.symbols), last, modules="numpy", cse=lambda expr: (before, expr))
+        named: Any = lambda expr: (before, expr)  # noqa: E731 - SymPy takes a function here, its annotation does not say so
+        return sympy.lambdify((MU, *self.symbols), last, modules="numpy", cse=named)
 
     def _mixture(self, prior: sympy.Expr) -> sympy.Expr:
         one, r = sympy.eye(1), sympy.Matrix([[self.r]])
@@ -221,9 +230,6 @@ class SimplifiedForm:
         outcomes = [outcome_by_information(given, one, r, m, algebra=SYMPY) for m in range(self.agents)]
         return average(outcomes, weights).P[0, 0]
 
-    def _matrices(self, p0: sympy.Expr) -> tuple[sympy.Matrix, sympy.Matrix, sympy.Matrix]:
-        return sympy.Matrix([[self.q]]), sympy.Matrix([[self.r]]), sympy.Matrix([[p0]])
-
     def _as_polynomials(self, fraction: Ratio) -> tuple[sympy.Poly, sympy.Poly]:
         """Numerator and denominator with integer coefficients, as polynomials in µ, the last generator."""
         parts = [fraction.numerator, fraction.denominator]
@@ -231,7 +237,8 @@ class SimplifiedForm:
         parts = [part.mul_ground(scale).set_ring(part.ring.clone(domain=sympy.ZZ)) for part in parts]
         content = sympy.igcd(*(part.content() for part in parts))
         N, D = (_in_mu(part.quo_ground(content)) for part in parts)
-        return (N, D) if self.symbols else N.cancel(D, include=True)
+        reduced: Any = (N, D) if self.symbols else N.cancel(D, include=True)
+        return reduced
 
 
 def derive_simplified(
@@ -248,8 +255,8 @@ def derive_simplified(
     Parameters
     ----------
     agents, step : number of agents and last step, at least 1.
-    q, r, p0 : process noise, measurement noise and initial variance: a number or its text ("0.1" and 0.1 are 1/10 exactly),
-        or None for a symbol.
+    q, r, p0 : process noise, measurement noise and initial variance: a number or its text ("0.1" and 0.1 are exactly
+        1/10), or None for a symbol.
     correlation : "independent" or "shared" initial estimates.
 
     Returns
@@ -294,6 +301,10 @@ def _in_mu(polynomial: Any) -> sympy.Poly:
         collected.setdefault(m, {})[tuple(powers)] = c
     domain = coefficients.to_domain()
     return sympy.Poly({(m,): coefficients.from_dict(c) for m, c in collected.items()}, MU, domain=domain)
+
+
+def _cell(value: Any) -> np.ndarray:
+    return np.array([[value]], dtype=object)
 
 
 def _rational(number: sympy.Expr) -> Any:

@@ -18,7 +18,13 @@ def model(rng, d, p):
     """F, Q, H, R, P0 of a stable, well-scaled random model."""
     F = rng.normal(size=(d, d))
     F /= max(1.0, np.abs(np.linalg.eigvals(F)).max())
-    return F, covariance(rng, d), rng.normal(size=(p, d)), covariance(rng, p) + 0.1 * np.eye(p), covariance(rng, d) + 0.1 * np.eye(d)
+    return (
+        F,
+        covariance(rng, d),
+        rng.normal(size=(p, d)),
+        covariance(rng, p) + 0.1 * np.eye(p),
+        covariance(rng, d) + 0.1 * np.eye(d),
+    )
 
 
 def mapping(F, Q, H, R, P0, agents=3, steps=4, **network):
@@ -28,3 +34,8 @@ def mapping(F, Q, H, R, P0, agents=3, steps=4, **network):
         "initial": {"P": np.asarray(P0).tolist()},
         "network": {"agents": agents, "steps": steps, **network},
     }
+
+
+def same(A, B):
+    """Whether two matrices over an exact field are equal, entry by entry."""
+    return all(a == b for a, b in zip(A.flat, B.flat, strict=True))

@@ -38,7 +38,13 @@ CASES = {
     "one sensor, R = 1e-14": (F[:2, :2], Q[:2, :2], H[:1, :2], 1e-14 * np.eye(1), P0[:2, :2]),
     "three sensors, R = 1e-10": (F, Q, np.vstack([ODD_H, [1, 1, 1, 1]]), 1e-10 * np.eye(3), P0),
     "scalar, R = 1e-14": (np.eye(1), 25 * np.eye(1), np.eye(1), 1e-14 * np.eye(1), 1e12 * np.eye(1)),
-    "mixed units": (F, Q * np.outer([1e6, 1, 1e-6, 1e-12], [1e6, 1, 1e-6, 1e-12]), H, np.eye(2), np.diag([1e10, 1, 1e-8, 1e-16])),
+    "mixed units": (
+        F,
+        Q * np.outer([1e6, 1, 1e-6, 1e-12], [1e6, 1, 1e-6, 1e-12]),
+        H,
+        np.eye(2),
+        np.diag([1e10, 1, 1e-8, 1e-16]),
+    ),
 }
 LINKS = (0.0, 0.1, 0.5, 1.0)
 
@@ -53,7 +59,9 @@ def test_to_nine_digits(case, agents):
         assert textbook.scaled_error(got[i], exact) < 1e-9
 
 
-@pytest.mark.parametrize("case", ["benign", "R = 1e-8", "R = 1e-14", "P0 = 1e12", "prior singular", "odd sensor, R = 1e-8"])
+@pytest.mark.parametrize(
+    "case", ["benign", "R = 1e-8", "R = 1e-14", "P0 = 1e12", "prior singular", "odd sensor, R = 1e-8"]
+)
 def test_unlike_agents_to_nine_digits(case):
     """Two of three agents have the same sensor, the third one twice the noise: updates one after the other."""
     F, Q, H, R, P0 = CASES[case]

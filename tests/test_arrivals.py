@@ -78,9 +78,9 @@ def test_averages_are_linked_and_bounded(seed, N):
     E, g = arrivals.remaining(s), arrivals.gained(s)
     np.testing.assert_allclose(E, 1 - s * g, rtol=0, atol=1e-13)
     tiny = 1e-13
-    assert (E <= 1 / (1 + s) * (1 + tiny)).all()  # never worse than alone
-    assert (E >= 1 / (1 + (N + 1) * s) * (1 - tiny)).all()  # never better than with everyone's measurement
-    assert (E >= 1 / (1 + (1 + N * link) * s) * (1 - tiny)).all()  # Jensen
+    assert (1 / (1 + s) * (1 + tiny) >= E).all()  # never worse than alone
+    assert (1 / (1 + (N + 1) * s) * (1 - tiny) <= E).all()  # never better than with everyone's measurement
+    assert (1 / (1 + (1 + N * link) * s) * (1 - tiny) <= E).all()  # Jensen
 
 
 def test_taking_items_keeps_their_distributions():

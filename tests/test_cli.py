@@ -23,7 +23,11 @@ ENV = {key: value for key, value in os.environ.items() if key not in ("COLUMNS",
 
 def run(*arguments, code=0, env=None, **options):
     done = subprocess.run(
-        [sys.executable, "-m", "stochfuse", *arguments], capture_output=True, text=True, env={**ENV, **(env or {})}, **options
+        [sys.executable, "-m", "stochfuse", *arguments],
+        capture_output=True,
+        text=True,
+        env={**ENV, **(env or {})},
+        **options,
     )
     assert done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr
@@ -65,7 +69,17 @@ def test_default_table_says_what_it_shows():
 
 def test_json_is_the_contract():
     result = strict_json(run("predict", "--format", "json", "--link", "0:1:0.5", "--steps", "2").stdout)
-    assert list(result)[:9] == ["schema", "version", "method", "quantity", "metric", "link", "steps", "values", "scenario"]
+    assert list(result)[:9] == [
+        "schema",
+        "version",
+        "method",
+        "quantity",
+        "metric",
+        "link",
+        "steps",
+        "values",
+        "scenario",
+    ]
     assert result["schema"] == "stochfuse.prediction/1"
     assert (result["method"], result["quantity"], result["metric"]) == ("simplified", "claimed", "trace")
     assert result["link"] == [0.0, 0.5, 1.0]
@@ -101,7 +115,11 @@ def test_any_terminal_width(columns):
 
 
 def test_csv_markdown_and_latex():
-    rows = list(csv.DictReader(io.StringIO(run("predict", "cv-2d", "-f", "csv", "--steps", "2", "--link", "0,1", "--steady").stdout)))
+    rows = list(
+        csv.DictReader(
+            io.StringIO(run("predict", "cv-2d", "-f", "csv", "--steps", "2", "--link", "0,1", "--steady").stdout)
+        )
+    )
     assert [row["step"] for row in rows] == ["1", "2", "steady"] * 2
     assert rows[0] | {"value": ""} == {
         "method": "simplified", "quantity": "claimed", "stage": "posterior", "nature": "approximate", "metric": "rms:x,y",
@@ -111,7 +129,9 @@ def test_csv_markdown_and_latex():
     markdown = run("predict", "-f", "markdown", "--link", "0.5").stdout
     assert "| µ | k=1 | k=2 | k=3 | k=4 | k=5 |\n| :-- | --: | --: | --: | --: | --: |\n| 0.5 | 58.333 |" in markdown
     latex = run("predict", "cv-2d", "-f", "latex", "--link", "0.5", "--metric", "det").stdout
-    assert latex.startswith("\\begin{table}\n  \\caption{Expected claimed posterior covariance: determinant over x, vx, y, vy")
+    assert latex.startswith(
+        "\\begin{table}\n  \\caption{Expected claimed posterior covariance: determinant over x, vx, y, vy"
+    )
     assert r"m$^2$ (m/s)$^2$" in latex
 
 
@@ -166,7 +186,10 @@ def test_scenario_commands(tmp_path):
     listing = strict_json(run("scenario", "list", "-f", "json").stdout)
     assert [entry["name"] for entry in listing] == ["cv-2d", "fcs-demo", "thesis-steady", "thesis-transient"]
     assert "fcs-demo" in run("scenario", "list").stdout
-    assert run("scenario", "check", "fcs-demo").stdout == "fcs-demo: ok: 10 agents, ad-hoc, 10 steps, state (x, vx, y, vy)\n"
+    assert (
+        run("scenario", "check", "fcs-demo").stdout
+        == "fcs-demo: ok: 10 agents, ad-hoc, 10 steps, state (x, vx, y, vy)\n"
+    )
     schema = strict_json(run("scenario", "schema").stdout)
     assert set(schema["properties"]) == {"schema", "description", "model", "initial", "network", "agent", "report"}
     new = tmp_path / "new.toml"
@@ -178,12 +201,27 @@ def test_scenario_commands(tmp_path):
 
 def test_derive_agrees_with_predict(tmp_path):
     text = run("derive", "simplified", "--agents", "3", "--step", "4", "--q", "25", "--r", "100", "--p0", "100").stdout
-    lines = dict(line.split(" = ", 1) for line in text.splitlines() if line.startswith("P_4 = (") )
+    lines = dict(line.split(" = ", 1) for line in text.splitlines() if line.startswith("P_4 = ("))
     closed = sympy.sympify(lines["P_4"])
     expected = sf.predict(sf.load_scenario(), [0.25]).values()[0, 3]
     assert float(closed.subs("mu", sympy.Rational(1, 4))) == pytest.approx(expected, rel=1e-14)
-    names = [f["key"] for f in strict_json(run("derive", "simplified", "--agents", "3", "--step", "2", "-f", "json").stdout)["formulas"]]
-    assert names == ["P_1", "P_2_prior", "P_2", "closed", "derivative", "series_at_0", "series_at_1", "fixed_point", "fixed_point_polynomial"]
+    names = [
+        f["key"]
+        for f in strict_json(run("derive", "simplified", "--agents", "3", "--step", "2", "-f", "json").stdout)[
+            "formulas"
+        ]
+    ]
+    assert names == [
+        "P_1",
+        "P_2_prior",
+        "P_2",
+        "closed",
+        "derivative",
+        "series_at_0",
+        "series_at_1",
+        "fixed_point",
+        "fixed_point_polynomial",
+    ]
     latex = run("derive", "--latex", "--agents", "2").stdout
     assert latex.count(r"\begin{equation*}") == latex.count(r"\end{equation*}") == 9
     assert r"\frac{\mathrm{d}P(2)}{\mathrm{d}\mu} = " in latex
@@ -203,7 +241,10 @@ def test_plots(tmp_path, suffix):
     assert [f.name for f in tmp_path.iterdir()] == [file.name]
 
 
-@pytest.mark.parametrize(("name", "format"), [("a.csv", "csv"), ("a.json", "json"), ("a.md", "markdown"), ("a.tex", "latex"), ("a.txt", "table")])
+@pytest.mark.parametrize(
+    ("name", "format"),
+    [("a.csv", "csv"), ("a.json", "json"), ("a.md", "markdown"), ("a.tex", "latex"), ("a.txt", "table")],
+)
 def test_output_goes_to_a_file_in_the_format_of_its_name(tmp_path, name, format):
     done = run("predict", "--output", str(tmp_path / name))
     assert done.stdout == ""
@@ -224,11 +265,20 @@ BAD = [
     (["predict", "--q", "nan"], "model.Q: expected a number or a 1×1 matrix"),
     (["predict", "--architecture", "star"], "Invalid value for '--architecture'"),
     (["predict", "--method", "guess"], "Invalid value for '--method'"),
-    (["predict", "--metric", "size"], "error: metric: expected trace, det, max-eig, var:STATE, std:STATE or rms:STATE,STATE,…, got 'size'"),
+    (
+        ["predict", "--metric", "size"],
+        "error: metric: expected trace, det, max-eig, var:STATE, std:STATE or rms:STATE,STATE,…, got 'size'",
+    ),
     (["predict", "--metric", "var:y"], "error: metric 'var:y': no state 'y'; the states are x"),
     (["predict", "cv-2d", "--metric", "var:x,y"], "expected one state, got 2; use rms: for several"),
-    (["predict", "fcs-demo", "--agent", "11"], "error: agent: expected mean, worst, best or a number from 1 to 10, got '11'"),
-    (["predict", "fcs-demo", "--agent", "some"], "error: agent: expected mean, worst, best or a number from 1 to 10, got 'some'"),
+    (
+        ["predict", "fcs-demo", "--agent", "11"],
+        "error: agent: expected mean, worst, best or a number from 1 to 10, got '11'",
+    ),
+    (
+        ["predict", "fcs-demo", "--agent", "some"],
+        "error: agent: expected mean, worst, best or a number from 1 to 10, got 'some'",
+    ),
     (["predict", "--output", "/nowhere/x.csv"], "error: cannot write /nowhere/x.csv: there is no directory /nowhere"),
     (["predict", "--output", "/tmp"], "error: cannot write /tmp: it is a directory"),
     (["predict", "--plot", "x.bmp"], "error: x.bmp: expected a name that ends in .png, .svg, .pdf"),
@@ -248,7 +298,9 @@ def test_wrong_usage_exits_2_with_a_message_and_no_output(arguments, message, tm
 
 
 def test_a_bad_file_names_every_key_and_leaves_no_output(tmp_path):
-    (tmp_path / "bad.toml").write_text("[model]\nF = 1\nH = 1\nQ = -1\nR = 0\n[initial]\nP = nan\n[network]\nagents = 3\nsteps = 2\nlink = 7\n")
+    (tmp_path / "bad.toml").write_text(
+        "[model]\nF = 1\nH = 1\nQ = -1\nR = 0\n[initial]\nP = nan\n[network]\nagents = 3\nsteps = 2\nlink = 7\n"
+    )
     done = run("predict", "bad.toml", "--output", "out.csv", code=2, cwd=tmp_path)
     for key in ("model.Q", "model.R", "initial.P", "network.link"):
         assert f"\n  {key}: expected " in done.stderr

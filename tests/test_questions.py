@@ -44,7 +44,7 @@ def test_slow_filters_are_finished_by_newton():
     for P, noise in zip(steady.P[:, 0, 0, 0], (1.0, 1 / 3), strict=True):
         q = 1e-8
         prior = (q + np.sqrt(q * q + 4 * q * noise)) / 2  # P⁻ = P⁻R/(P⁻ + R) + q
-        assert P == pytest.approx(prior - q, rel=1e-9)
+        assert pytest.approx(prior - q, rel=1e-9) == P
     assert (steady.bound <= 1e-6).all()
 
 
@@ -56,7 +56,7 @@ def test_unlike_agents_and_a_critical_link_probability():
     steady = sf.steady_state(s, [0.6])
     P = steady.P[0, steady.group_of[1], 0, 0]
     prior = 1.44 * P + 1
-    assert P == pytest.approx(0.6 * prior / (1 + prior) + 0.4 * prior, rel=1e-9)
+    assert pytest.approx(0.6 * prior / (1 + prior) + 0.4 * prior, rel=1e-9) == P
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,9 @@ def test_unlike_agents_and_a_critical_link_probability():
 def test_an_unobserved_mode_has_no_steady_state(F, H, mode):
     d = np.atleast_2d(F).shape[0]
     s = sf.Scenario.from_mapping(mapping(F, np.eye(d), H, np.eye(1), np.eye(d)))
-    with pytest.raises(sf.NoAnswerError, match=f"no steady state: .* the mode of F with eigenvalue {mode} is not observed by H"):
+    with pytest.raises(
+        sf.NoAnswerError, match=f"no steady state: .* the mode of F with eigenvalue {mode} is not observed by H"
+    ):
         sf.steady_state(s)
 
 

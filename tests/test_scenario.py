@@ -15,7 +15,14 @@ from stochfuse.schema import structure_problems
 
 GOOD = {
     "schema": "stochfuse.scenario/1",
-    "model": {"F": [[1, 1], [0, 1]], "H": [[1, 0]], "Q": [[1, 0], [0, 1]], "R": 4, "states": ["x", "v"], "units": ["m", "m/s"]},
+    "model": {
+        "F": [[1, 1], [0, 1]],
+        "H": [[1, 0]],
+        "Q": [[1, 0], [0, 1]],
+        "R": 4,
+        "states": ["x", "v"],
+        "units": ["m", "m/s"],
+    },
     "initial": {"P": [[9, 0], [0, 4]], "correlation": "shared", "error": [1, 2]},
     "network": {"agents": 3, "steps": 2, "architecture": "broadcast", "link": 0.5, "delay": 0},
 }
@@ -60,49 +67,129 @@ BAD = [
     ("colour", 3, "colour: expected a known key, got an unknown one, 'colour'"),
     ("schema", "other/2", "schema: expected one of \"stochfuse.scenario/1\", got 'other/2'"),
     ("model", 5, "model: expected a table, got 5"),
-    ("model.F", "fast", "model.F: expected a number or a matrix (a list of rows), or one such matrix per step, got 'fast'"),
-    ("model.F", [1, 2], "model.F: expected a number or a matrix (a list of rows), or one such matrix per step, got [1, 2]"),
-    ("model.F", [[1, 2], [3]], "model.F: expected a number or a matrix (a list of rows), or one such matrix per step, got [[1, 2], [3]] (rows of"),
+    (
+        "model.F",
+        "fast",
+        "model.F: expected a number or a matrix (a list of rows), or one such matrix per step, got 'fast'",
+    ),
+    (
+        "model.F",
+        [1, 2],
+        "model.F: expected a number or a matrix (a list of rows), or one such matrix per step, got [1, 2]",
+    ),
+    (
+        "model.F",
+        [[1, 2], [3]],
+        "model.F: expected a number or a matrix (a list of rows), or one such matrix per step, got [[1, 2], [3]] (rows of",
+    ),
     ("model.F", [[1, 2, 3], [4, 5, 6]], "model.F: expected a square matrix, got a 2×3 matrix"),
-    ("model.F", [[1, NAN], [0, 1]], "model.F: expected a number or a matrix (a list of rows), or one such matrix per step, got a value that is not finite"),
+    (
+        "model.F",
+        [[1, NAN], [0, 1]],
+        "model.F: expected a number or a matrix (a list of rows), or one such matrix per step, got a value that is not finite",
+    ),
     ("model.F", [[[1, 0], [0, 1]]], "model.F: expected one matrix for each of the 2 steps, got 1 matrices"),
-    ("model.H", [[1, 0, 0]], "model.H: expected a number or a matrix with 2 columns (a list of rows), or one such matrix per step, got a 1×3 matrix"),
-    ("model.Q", [[1]], "model.Q: expected a number or a 2×2 matrix (a list of rows), or one such matrix per step, got a 1×1 matrix"),
-    ("model.Q", [[1, 2], [2, 1]], "model.Q: expected a symmetric positive semi-definite matrix, got an indefinite one (smallest eigenvalue, scaled to unit variances, -1)"),
-    ("model.Q", [[1, 0.5], [0, 1]], "model.Q: expected a symmetric positive semi-definite matrix, got an asymmetric one"),
-    ("model.Q", -1, "model.Q: expected a symmetric positive semi-definite matrix, got a variance of -1 on the diagonal"),
+    (
+        "model.H",
+        [[1, 0, 0]],
+        "model.H: expected a number or a matrix with 2 columns (a list of rows), or one such matrix per step, got a 1×3 matrix",
+    ),
+    (
+        "model.Q",
+        [[1]],
+        "model.Q: expected a number or a 2×2 matrix (a list of rows), or one such matrix per step, got a 1×1 matrix",
+    ),
+    (
+        "model.Q",
+        [[1, 2], [2, 1]],
+        "model.Q: expected a symmetric positive semi-definite matrix, got an indefinite one (smallest eigenvalue, scaled to unit variances, -1)",
+    ),
+    (
+        "model.Q",
+        [[1, 0.5], [0, 1]],
+        "model.Q: expected a symmetric positive semi-definite matrix, got an asymmetric one",
+    ),
+    (
+        "model.Q",
+        -1,
+        "model.Q: expected a symmetric positive semi-definite matrix, got a variance of -1 on the diagonal",
+    ),
     ("model.R", 0, "model.R: expected a symmetric positive definite matrix, got a variance of 0 on the diagonal"),
-    ("model.R", float("inf"), "model.R: expected a number or a 1×1 matrix (a list of rows), or one such matrix per step, got a value that is not finite (NaN or infinity)"),
+    (
+        "model.R",
+        float("inf"),
+        "model.R: expected a number or a 1×1 matrix (a list of rows), or one such matrix per step, got a value that is not finite (NaN or infinity)",
+    ),
     ("model.R", True, "model.R: expected a number or a matrix (a list of rows), or one such matrix per step, got True"),
     ("model.u", [1], "model.B: expected an input matrix, since model.u is given, got nothing"),
     ("model.states", ["x"], "model.states: expected 2 names, one per state, got 1"),
     ("model.states", ["x", "x"], "model.states: expected different names, got ['x', 'x']"),
     ("model.units", ["m", "s", "kg"], "model.units: expected 2 names, one per state, got 3"),
     ("initial.P", None, "initial.P: expected a value, got nothing"),
-    ("initial.P", [[1, 0], [0, -1]], "initial.P: expected a symmetric positive semi-definite matrix, got a variance of -1 on the diagonal"),
-    ("initial.P", [[[1, 0], [0, 1]]] * 2, "initial.P: expected a number or a 2×2 matrix (a list of rows), got [[[1, 0]"),
-    ("initial.correlation", "some", "initial.correlation: expected one of \"independent\", \"shared\", got 'some'"),
+    (
+        "initial.P",
+        [[1, 0], [0, -1]],
+        "initial.P: expected a symmetric positive semi-definite matrix, got a variance of -1 on the diagonal",
+    ),
+    (
+        "initial.P",
+        [[[1, 0], [0, 1]]] * 2,
+        "initial.P: expected a number or a 2×2 matrix (a list of rows), got [[[1, 0]",
+    ),
+    ("initial.correlation", "some", 'initial.correlation: expected one of "independent", "shared", got \'some\''),
     ("initial.error", [1], "initial.error: expected a list of 2 numbers, got [1]"),
     ("initial.x", [1, 2, 3], "initial.x: expected a list of 2 numbers, got [1, 2, 3]"),
     ("network.agents", 0, "network.agents: expected a whole number of at least 1, got 0"),
     ("network.agents", 2.5, "network.agents: expected a whole number, got 2.5"),
     ("network.steps", "five", "network.steps: expected a whole number, got 'five'"),
-    ("network.architecture", "star", "network.architecture: expected one of \"ad-hoc\", \"broadcast\", \"cyclic\", got 'star'"),
+    (
+        "network.architecture",
+        "star",
+        'network.architecture: expected one of "ad-hoc", "broadcast", "cyclic", got \'star\'',
+    ),
     ("network.link", 1.5, "network.link: expected probabilities between 0 and 1, got 1.5"),
     ("network.link", -0.1, "network.link: expected probabilities between 0 and 1, got -0.1"),
     ("network.link", NAN, "network.link: expected a probability, a 3×3 matrix"),
-    ("network.link", [0.5], "network.link: expected a probability, a 3×3 matrix of them (row: receiver, column: sender), or one of either for each of the 2 steps, got 1 entries"),
-    ("network.link", [[0, 1], [1, 0]], "network.link: expected a probability, a 3×3 matrix of them (row: receiver, column: sender), or one of either for each of the 2 steps, got an array of 2×2"),
-    ("network.link", "high", "network.link: expected a probability, a matrix of them, or one of either per step, got 'high'"),
+    (
+        "network.link",
+        [0.5],
+        "network.link: expected a probability, a 3×3 matrix of them (row: receiver, column: sender), or one of either for each of the 2 steps, got 1 entries",
+    ),
+    (
+        "network.link",
+        [[0, 1], [1, 0]],
+        "network.link: expected a probability, a 3×3 matrix of them (row: receiver, column: sender), or one of either for each of the 2 steps, got an array of 2×2",
+    ),
+    (
+        "network.link",
+        "high",
+        "network.link: expected a probability, a matrix of them, or one of either per step, got 'high'",
+    ),
     ("network.link", [[0, 0.2, 0.3], [0.1, 0, 0.3], [0.1, 0.2, 0]], None),
-    ("network.link", [[0, 0.9, 0.3], [0.1, 0, 0.3], [0.1, 0.2, 0]], "network.link: expected equal probabilities in each column (a broadcast is heard by all or by none), got unequal ones"),
-    ("network.delay", -1, "network.delay: expected a whole number of steps, or the probabilities of 0, 1, 2 … steps, got -1"),
-    ("network.delay", [0.5, 0.4], "network.delay: expected probabilities of 0, 1, 2 … steps that sum to 1, got [0.5, 0.4]"),
+    (
+        "network.link",
+        [[0, 0.9, 0.3], [0.1, 0, 0.3], [0.1, 0.2, 0]],
+        "network.link: expected equal probabilities in each column (a broadcast is heard by all or by none), got unequal ones",
+    ),
+    (
+        "network.delay",
+        -1,
+        "network.delay: expected a whole number of steps, or the probabilities of 0, 1, 2 … steps, got -1",
+    ),
+    (
+        "network.delay",
+        [0.5, 0.4],
+        "network.delay: expected probabilities of 0, 1, 2 … steps that sum to 1, got [0.5, 0.4]",
+    ),
     ("network.case", [{"name": "a", "link": 2}], "network.case[1].link: expected probabilities between 0 and 1, got 2"),
     ("network.case", [{"link": 0.2}], "network.case[1].name: expected a value, got nothing"),
     ("agent", [{}], "agent: expected one [[agent]] table for each of the 3 agents, got 1"),
     ("agent", [{}, {"R": 0}, {}], "agent[2].R: expected a symmetric positive definite matrix, got a variance of 0"),
-    ("agent", [{}, {"H": [[1, 0], [0, 1]]}, {}], "agent[2].R: expected a 2×2 matrix, to go with its own H, got nothing"),
+    (
+        "agent",
+        [{}, {"H": [[1, 0], [0, 1]]}, {}],
+        "agent[2].R: expected a 2×2 matrix, to go with its own H, got nothing",
+    ),
     ("agent", [{}, {"Q": 1}, {}], "agent[2].Q: expected a known key, got an unknown one, 'Q'"),
     ("report", {"metric": 3}, "report.metric: expected text, got 3"),
 ]
@@ -154,7 +241,9 @@ def test_malformed_files_name_the_place(tmp_path, text, message):
 
 
 def test_files_that_cannot_be_read(tmp_path):
-    with pytest.raises(sf.ScenarioError, match=r"nothing.toml: no such file, and no preset of that name \(presets: cv-2d"):
+    with pytest.raises(
+        sf.ScenarioError, match=r"nothing.toml: no such file, and no preset of that name \(presets: cv-2d"
+    ):
         sf.load_scenario(tmp_path / "nothing.toml")
     with pytest.raises(sf.ScenarioError, match="cannot be read: Is a directory"):
         sf.load_scenario(tmp_path)
@@ -182,7 +271,7 @@ def test_overrides_take_the_place_of_keys():
     assert many.sensors[0].R.tolist() == [[2, 0], [0, 2]]
     with pytest.raises(TypeError, match="unexpected keyword argument 'colour'"):
         sf.load_scenario(colour=1)
-    with pytest.raises(sf.ScenarioError, match="network.link: expected .* a 4×4 matrix .* got an array of 10×10"):
+    with pytest.raises(sf.ScenarioError, match=r"network.link: expected .* a 4×4 matrix .* got an array of 10×10"):
         sf.load_scenario("fcs-demo", agents=4)
     assert sf.load_scenario("fcs-demo", agents=4, uniform_link=True).network.agents == 4
 

@@ -48,7 +48,11 @@ def test_unequal_links_and_unlike_agents_match_every_set_of_senders(seed, d, age
     rng = np.random.default_rng(seed)
     F, Q, H, R, P0 = model(rng, d, 2)
     steps = 3
-    links = rng.choice([0.0, 1.0, 0.3, 0.8], size=(steps, agents, agents)) if time_varying else rng.uniform(size=(agents, agents))
+    links = (
+        rng.choice([0.0, 1.0, 0.3, 0.8], size=(steps, agents, agents))
+        if time_varying
+        else rng.uniform(size=(agents, agents))
+    )
     source = mapping(F, Q, H, R, P0, agents=agents, steps=steps, link=links.tolist())
     sensors = [(H, R)] * agents
     if kind != "like":
@@ -91,7 +95,9 @@ def test_masked_network_is_noted_and_a_full_one_is_not():
         "some links have probability 0: on a masked network (54) is an approximation outside its derivation, "
         "evaluated with the possible senders of each agent",
     )
-    full = sf.predict(scenario(*model(rng, 1, 1), agents=3, steps=2, link=[[0, 0.5, 0.1], [0.2, 0, 0.1], [0.2, 0.5, 0]]))
+    full = sf.predict(
+        scenario(*model(rng, 1, 1), agents=3, steps=2, link=[[0, 0.5, 0.1], [0.2, 0, 0.1], [0.2, 0.5, 0]])
+    )
     assert full.notes == ()
 
 
@@ -230,14 +236,18 @@ def test_the_three_forms_of_an_outcome_agree():
 
 def test_delay_is_refused_with_the_reason():
     source = mapping(1.0, 1.0, 1.0, 1.0, 1.0, delay=[0.5, 0.5])
-    with pytest.raises(sf.UsageError, match=r"method 'simplified' is derived without delay \(thesis 4.2\); network.delay must be 0"):
+    with pytest.raises(
+        sf.UsageError, match=r"method 'simplified' is derived without delay \(thesis 4.2\); network.delay must be 0"
+    ):
         sf.predict(sf.Scenario.from_mapping(source))
 
 
 def test_too_many_unlike_agents_are_refused_with_the_number():
     source = mapping(1.0, 1.0, 1.0, 1.0, 1.0, agents=20, steps=2)
     source["agent"] = [{"R": float(j)} for j in range(1, 21)]
-    with pytest.raises(sf.UsageError, match=r"unlike agents make 524288 sets of senders to average over \(at most 100000"):
+    with pytest.raises(
+        sf.UsageError, match=r"unlike agents make 524288 sets of senders to average over \(at most 100000"
+    ):
         sf.predict(sf.Scenario.from_mapping(source))
 
 

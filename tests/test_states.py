@@ -28,7 +28,10 @@ def literal(given, x0, z, agents, mu, printed):
     inv = np.linalg.inv
     P_m = [P0 / (m + 1) for m in range(agents)]
     P = sum(w * Pm for w, Pm in zip(weights, P_m, strict=True))
-    x = sum(w * (P if printed else Pm) @ ((m + 1) * inv(P0) @ x0) for m, (w, Pm) in enumerate(zip(weights, P_m, strict=True)))
+    x = sum(
+        w * (P if printed else Pm) @ ((m + 1) * inv(P0) @ x0)
+        for m, (w, Pm) in enumerate(zip(weights, P_m, strict=True))
+    )
     out = [x]
     for k in range(1, len(z)):
         prior_x, prior = F @ x, textbook.kalman_predict(P, F, Q)
@@ -68,7 +71,8 @@ def test_the_printed_form_is_biased_by_7_6_at_step_one():
 
 def test_published_kalman_case():
     """Theory section 10 gives x̂ = (5.116244352839, 1.045095743855) after five measurements; exact rational arithmetic
-    gives 5.116244345838…, 1.045095737855…: the page is right to eight digits only."""
+    gives 5.116244345838…, 1.045095737855…: the page is right to eight digits only.
+    """
     exact = rational_filter(["0.9", "2", "3.1", "3.9", "5.2"])
     assert [float(v) for v in exact] == pytest.approx([5.116244345837822, 1.045095737854621], rel=1e-15)
     source = mapping([[1, 1], [0, 1]], np.diag([0.05, 0.01]), [[1, 0]], 0.25, np.eye(2), agents=1, steps=6)
@@ -93,7 +97,7 @@ def rational_filter(measurements):
 
 @pytest.mark.parametrize("unlike", [False, True])
 def test_own_records_are_averaged_over_every_set_of_senders(unlike):
-    source, (F, Q, H, R, P0), x0, rng = setup(5, 2, 1, 3)
+    source, (F, Q, H, R, _), x0, rng = setup(5, 2, 1, 3)
     links = rng.uniform(size=(3, 3))
     source["network"]["link"] = links.tolist()
     noises = [1.0, 2.0, 5.0] if unlike else [float(R[0, 0])] * 3
@@ -112,7 +116,9 @@ def test_own_records_are_averaged_over_every_set_of_senders(unlike):
             x = np.zeros_like(x0)
             for a in (False, True):
                 for b in (False, True):
-                    weight = np.prod([links[i, j] if h else 1 - links[i, j] for j, h in zip(others, (a, b), strict=True)])
+                    weight = np.prod(
+                        [links[i, j] if h else 1 - links[i, j] for j, h in zip(others, (a, b), strict=True)]
+                    )
                     now_x, now_P = prior_x, prior
                     for j in [i] + [j for j, h in zip(others, (a, b), strict=True) if h]:
                         now_x = textbook.kalman_state(now_x, now_P, H, np.array([[noises[j]]]), z[k, j][:, None])
@@ -139,7 +145,11 @@ def test_a_known_input_moves_the_state():
 @pytest.mark.parametrize(
     ("z", "options", "message"),
     [
-        (np.zeros((2, 1)), {}, r"measurements: expected shape \(steps, p\) or \(steps, agents, p\) with 4 steps, 3 agents and p = 1"),
+        (
+            np.zeros((2, 1)),
+            {},
+            r"measurements: expected shape \(steps, p\) or \(steps, agents, p\) with 4 steps, 3 agents and p = 1",
+        ),
         (np.zeros((4, 2)), {}, r"got \(4, 2\)"),
         (np.zeros((4, 5, 1)), {}, r"got \(4, 5, 1\)"),
         (np.full((4, 1), np.nan), {}, "measurements: expected finite numbers"),

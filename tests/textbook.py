@@ -39,10 +39,8 @@ def binomial(m, N, mu):
 def simplified_literal(F, Q, H, R, P0, agents, mu, steps, shared=False):
     """(54) as printed, with inverses, one link probability."""
     N = agents - 1
-    if shared:
-        P = P0
-    else:
-        P = sum(binomial(m, N, mu) * np.linalg.inv((m + 1) * np.linalg.inv(P0)) for m in range(agents))
+    own = [np.linalg.inv((m + 1) * np.linalg.inv(P0)) for m in range(agents)]
+    P = P0 if shared else sum(binomial(m, N, mu) * own[m] for m in range(agents))
     out = [P]
     for _ in range(steps - 1):
         prior = kalman_predict(P, F, Q)
@@ -63,9 +61,9 @@ def simplified_subsets(F, Q, sensors, P0, links, steps, agent, shared=False):
     def sets(link):
         for heard in product([False, True], repeat=len(others)):
             weight = 1.0
-            for j, h in zip(others, heard):
+            for j, h in zip(others, heard, strict=True):
                 weight *= link[agent][j] if h else 1 - link[agent][j]
-            yield weight, [j for j, h in zip(others, heard) if h]
+            yield weight, [j for j, h in zip(others, heard, strict=True) if h]
 
     P = P0 if shared else sum(w * P0 / (len(S) + 1) for w, S in sets(links[0]))
     out = [P]

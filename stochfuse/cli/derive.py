@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from enum import Enum
+from enum import StrEnum
 from typing import Annotated
 
 import typer
@@ -10,13 +10,13 @@ import typer
 from stochfuse.cli.options import OutputOption
 
 
-class Formulation(str, Enum):
+class Formulation(StrEnum):
     """Formulations that can be derived."""
 
     simplified = "simplified"
 
 
-class FormulaFormat(str, Enum):
+class FormulaFormat(StrEnum):
     """How formulas are written."""
 
     text = "text"
@@ -24,7 +24,7 @@ class FormulaFormat(str, Enum):
     json = "json"
 
 
-class Correlation(str, Enum):
+class Correlation(StrEnum):
     """Initial estimates."""
 
     independent = "independent"
@@ -44,7 +44,8 @@ def derive(
     correlation: Annotated[Correlation, typer.Option(help="Initial estimates.")] = Correlation.independent,
     latex: Annotated[bool, typer.Option("--latex", help="The same as --format latex.")] = False,
     format: Annotated[
-        FormulaFormat, typer.Option("--format", "-f", help="text: two-dimensional in a terminal, one line each when piped.")
+        FormulaFormat,
+        typer.Option("--format", "-f", help="text: two-dimensional in a terminal, one line each when piped."),
     ] = FormulaFormat.text,
     output: OutputOption = None,
 ) -> None:

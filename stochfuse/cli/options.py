@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from enum import Enum
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +11,7 @@ import typer
 MOST_LINKS = 1_000_000
 
 
-class Format(str, Enum):
+class Format(StrEnum):
     """Output formats."""
 
     table = "table"
@@ -21,7 +21,7 @@ class Format(str, Enum):
     latex = "latex"
 
 
-class Architecture(str, Enum):
+class Architecture(StrEnum):
     """Network architectures."""
 
     ad_hoc = "ad-hoc"
@@ -84,7 +84,7 @@ def parse_link(text: str) -> list[float]:
 def _range(text: str, first: float, last: float, step: float) -> list[float]:
     from stochfuse.errors import UsageError
 
-    if not (step > 0 and last >= first and 0 <= first and last <= 1):
+    if not (step > 0 and last >= first and first >= 0 and last <= 1):
         raise UsageError(f"--link: expected first:last:step with 0 ≤ first ≤ last ≤ 1 and step > 0, got '{text}'")
     count = (last - first) / step
     if count > MOST_LINKS:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from enum import Enum
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from stochfuse.report.predictions import View
 
 
-class Method(str, Enum):
+class Method(StrEnum):
     """Methods of prediction."""
 
     simplified = "simplified"
 
 
-class Quantity(str, Enum):
+class Quantity(StrEnum):
     """Quantities predicted."""
 
     claimed = "claimed"
@@ -40,23 +40,32 @@ def predict(
     steps: Annotated[int | None, typer.Option(min=1, help="Number of time steps.")] = None,
     link: Annotated[
         str | None,
-        typer.Option(metavar="SPEC", help="Link probabilities, for all links alike: 0.5, 0.2,0.5 or 0:1:0.25 (both ends)."),
+        typer.Option(
+            metavar="SPEC", help="Link probabilities, for all links alike: 0.5, 0.2,0.5 or 0:1:0.25 (both ends)."
+        ),
     ] = None,
     q: Annotated[float | None, typer.Option(help="Process noise variance Q (times the identity).")] = None,
     r: Annotated[float | None, typer.Option(help="Measurement noise variance R (times the identity).")] = None,
-    p0: Annotated[float | None, typer.Option(help="Variance of the initial estimates P(k0) (times the identity).")] = None,
+    p0: Annotated[
+        float | None, typer.Option(help="Variance of the initial estimates P(k0) (times the identity).")
+    ] = None,
     architecture: Annotated[Architecture | None, typer.Option(help="Who may hear whom.")] = None,
     method: Annotated[Method, typer.Option(help="How to average over which messages arrive.")] = Method.simplified,
     quantity: Annotated[Quantity, typer.Option(help="Which covariance.")] = Quantity.claimed,
     metric: Annotated[
         str | None,
-        typer.Option(help="trace, det, max-eig, var:STATE, std:STATE or rms:STATE,STATE; default: the scenario's, else trace."),
+        typer.Option(
+            help="trace, det, max-eig, var:STATE, std:STATE or rms:STATE,STATE; default: the scenario's, else trace."
+        ),
     ] = None,
     agent: Annotated[
-        str, typer.Option(metavar="N", help="Whose covariance where agents differ: mean, worst, best or an agent's number.")
+        str,
+        typer.Option(metavar="N", help="Whose covariance where agents differ: mean, worst, best or an agent's number."),
     ] = "mean",
     normalise: Annotated[bool, typer.Option("--normalise", help="Relative to link probability 0.")] = False,
-    steady: Annotated[bool, typer.Option("--steady", help="Add the steady state, P = g(P), with a proved bound.")] = False,
+    steady: Annotated[
+        bool, typer.Option("--steady", help="Add the steady state, P = g(P), with a proved bound.")
+    ] = False,
     digits: Annotated[int, typer.Option(min=1, max=17, help="Significant digits in tables.")] = 5,
     format: FormatOption = None,
     output: OutputOption = None,
@@ -107,9 +116,13 @@ def _warn(view: View) -> None:
     if bound is not None:
         worst = bound.max()
         if worst < 1:
-            typer.echo(f"note: the steady state is proved to lie within a relative {worst:.0e} of the value shown", err=True)
+            typer.echo(
+                f"note: the steady state is proved to lie within a relative {worst:.0e} of the value shown", err=True
+            )
         else:
-            typer.echo("note: the steady state's residual is at rounding level, but no bound on it could be proved", err=True)
+            typer.echo(
+                "note: the steady state's residual is at rounding level, but no bound on it could be proved", err=True
+            )
 
 
 def _states(view: View) -> tuple[tuple[str, ...], tuple[str, ...]]:

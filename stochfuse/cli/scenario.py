@@ -11,7 +11,7 @@ from stochfuse.cli.options import Format, FormatOption, OutputOption, ScenarioAr
 app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="The scenarios: list, show, check, schema, new.")
 
 NEW_HEADER = """\
-# A stochfuse scenario.  `stochfuse scenario check FILE` says what does not fit; `stochfuse scenario schema` lists the keys.
+# A stochfuse scenario.  `stochfuse scenario check FILE` says what does not fit; `stochfuse scenario schema` lists keys.
 # Predict with: stochfuse predict FILE
 """
 
@@ -80,7 +80,9 @@ def schema(output: OutputOption = None) -> None:
 
 @app.command()
 def new(
-    preset: Annotated[str, typer.Argument(help="The preset to begin with.", autocompletion=complete_scenario)] = "cv-2d",
+    preset: Annotated[
+        str, typer.Argument(help="The preset to begin with.", autocompletion=complete_scenario)
+    ] = "cv-2d",
     output: OutputOption = None,
 ) -> None:
     """Print a scenario file to begin with; --output saves it and never overwrites."""

@@ -85,7 +85,7 @@ class Case:
     items: int
 
     def first_share(self) -> np.ndarray:
-        """Share of P0 that the exchange at step 1 leaves, shape (items,): E[1/(m+1)], or 1 if all share one estimate."""
+        """Share of P0 that the exchange at step 1 leaves, shape (items,): E[1/(m+1)], or 1 for one shared estimate."""
         return np.ones(self.items) if self.shared else self.arrivals[0].reciprocal()
 
     def take(self, items: np.ndarray) -> Case:
@@ -149,9 +149,7 @@ class SquareRoot:
     def advance(self, carried: Carried, step: int) -> Carried:
         model, sensor, arrivals = self.case.model, self.case.sensor, self.case.arrivals[step - 1]
         prior = predict_factor(carried.value, at_step(model.F, step), factor(at_step(model.Q, step)))
-        L = update_factor(
-            prior, at_step(sensor.H, step), at_step(sensor.R, step), lambda s: arrivals.remaining(s.T).T
-        )
+        L = update_factor(prior, at_step(sensor.H, step), at_step(sensor.R, step), lambda s: arrivals.remaining(s.T).T)
         return Carried(L, carried.left)
 
     def covariance(self, carried: Carried) -> np.ndarray:

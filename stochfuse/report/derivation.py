@@ -26,9 +26,9 @@ def title(form: SimplifiedForm) -> str:
     start = "shared" if form.shared else "independent"
     agents = "1 agent" if form.agents == 1 else f"{form.agents} like agents"
     return (
-        f"Simplified formulation (54), {agents}, scalar state with F = G = H = 1, {start} initial estimates: expected claimed "
-        f"posterior covariance P_k after step k (approximate: mean field). mu: link probability, q, r: process and "
-        f"measurement noise variance, p0: variance of the initial estimates"
+        f"Simplified formulation (54), {agents}, scalar state with F = G = H = 1, {start} initial estimates: expected "
+        f"claimed posterior covariance P_k after step k (approximate: mean field). mu: link probability, q, r: process "
+        f"and measurement noise variance, p0: variance of the initial estimates"
     )
 
 
@@ -39,7 +39,11 @@ def formulas(form: SimplifiedForm) -> list[Formula]:
     lines = []
     for name, expression in form.chain:
         prior = str(name).endswith("_prior")
-        text = f"prior of step {str(name).split('_')[1]}, P(k|k-1)" if prior else "average over the number of arrivals, (54)"
+        text = (
+            f"prior of step {str(name).split('_')[1]}, P(k|k-1)"
+            if prior
+            else "average over the number of arrivals, (54)"
+        )
         lines.append(Formula(str(name), text, name, expression))
     if form.expandable:
         lines += [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from textwrap import wrap
 
 import numpy as np
 
@@ -26,10 +27,11 @@ def plot_prediction(view: View, output: Path) -> None:
     write_file(output, lambda path: figure.savefig(path, dpi=150))
 
 
-def draw(view: View):  # noqa: ANN201 - matplotlib is imported only here
+def draw(view: View):
     """Return the figure, not shown and not registered with pyplot."""
     try:
         from matplotlib.figure import Figure
+        from matplotlib.ticker import MaxNLocator
     except ImportError:
         raise StochfuseError("plots need matplotlib: pip install 'stochfuse[plot]'") from None
     p, values = view.prediction, view.values()
@@ -46,19 +48,20 @@ def draw(view: View):  # noqa: ANN201 - matplotlib is imported only here
         names = p.cases or [f"mean µ = {µ:.3g}" for µ in p.link]
         curves = [(names[i], p.steps, values[i]) for i in chosen]
         axes.set_xlabel("step k")
-        axes.xaxis.get_major_locator().set_params(integer=True)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         legend = "links" if len(chosen) == len(p.link) else f"links ({len(chosen)} of {len(p.link)})"
     _draw_curves(axes, curves)
-    axes.set_ylabel(view.metric.label + (f" [{view.unit}]" if view.unit else " / its value at µ = 0" if view.baseline else ""))
+    short = view.metric.label.partition(" (")[0]
+    axes.set_ylabel(short + (f" [{view.unit}]" if view.unit else ", relative to µ = 0" if view.baseline else ""))
     axes.set_ylim(bottom=0)
     axes.grid(alpha=0.3)
     axes.legend(title=legend, fontsize="small")
-    figure.suptitle(view.what, fontsize="medium")
+    figure.suptitle("\n".join(wrap(view.what, 80)), fontsize="medium")
     axes.set_title(f"{view.whom}\n{view.how}", fontsize="small")
     return figure
 
 
-def _draw_curves(axes, curves: list[tuple[str, np.ndarray, np.ndarray]]) -> None:  # noqa: ANN001
+def _draw_curves(axes, curves: list[tuple[str, np.ndarray, np.ndarray]]) -> None:
     from matplotlib import colormaps
 
     colors = colormaps["viridis"](np.linspace(0, 0.9, len(curves)))

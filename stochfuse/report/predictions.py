@@ -75,8 +75,9 @@ class View:
     @property
     def whom(self) -> str:
         """One line: the scenario and whose covariance."""
-        network = self.prediction.scenario.network
-        return f"{self.prediction.scenario.name}: {network.agents} agent{'s' * (network.agents > 1)}, {network.architecture}; {self._of}"
+        scenario = self.prediction.scenario
+        n = scenario.network.agents
+        return f"{scenario.name}: {n} agent{'s' * (n > 1)}, {scenario.network.architecture}; {self._of}"
 
     @property
     def _of(self) -> str:
@@ -98,7 +99,9 @@ class View:
 
 def _finite(values: np.ndarray) -> np.ndarray:
     if not np.isfinite(values).all():
-        raise StochfuseError("the prediction is not finite: the covariance grows beyond floating point; take fewer steps")
+        raise StochfuseError(
+            "the prediction is not finite: the covariance grows beyond floating point; take fewer steps"
+        )
     return values
 
 

@@ -44,7 +44,7 @@ def number(value: float, digits: int = 5) -> str:
 
 
 def to_text(table: Table, width: int | None = 80) -> str:
-    """Return the table for a terminal of some width; what does not fit beside is put below. No width: one wide table."""
+    """Return the table for a terminal of some width; what does not fit beside is put below.  No width: one table."""
     output = io.StringIO()
     room = width or 1_000_000
     console = Console(file=output, width=room, markup=False, highlight=False, emoji=False, color_system=None)
@@ -56,7 +56,10 @@ def to_text(table: Table, width: int | None = 80) -> str:
             key = index < len(table.keys)
             text = key and not all(_numeric(row[index]) for row in table.rows)
             rich.add_column(
-                table.headings[index], justify="left" if text or not table.columns else "right", no_wrap=not text, overflow="fold"
+                table.headings[index],
+                justify="left" if text or not table.columns else "right",
+                no_wrap=not text,
+                overflow="fold",
             )
         for row in table.rows:
             rich.add_row(*(row[index] for index in columns))
