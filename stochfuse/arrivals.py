@@ -18,6 +18,7 @@ coefficient that could overflow and exactly at µ = 0 and µ = 1.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from math import comb
 from typing import Protocol
 
@@ -49,7 +50,7 @@ class Arrivals(Protocol):
         """E[1/(m+1)], shape (items,): what remains at step 1, where independent initial estimates are averaged."""
         ...
 
-    def take(self, items: np.ndarray) -> Arrivals:
+    def take(self, items: np.ndarray | slice) -> Arrivals:
         """Return the distributions of some items."""
         ...
 
@@ -71,15 +72,19 @@ class Counts:
 
     def gained(self, s: np.ndarray) -> np.ndarray:
         """g(s)."""
-        return self._average(s, self.weights * self._arrived)
+        return self._average(s, self._gains)
 
     def reciprocal(self) -> np.ndarray:
         """E[1/(m+1)]."""
         return (self.weights / self._arrived).sum(axis=0)
 
-    def take(self, items: np.ndarray) -> Counts:
+    def take(self, items: np.ndarray | slice) -> Counts:
         """Return the distributions of some items."""
         return Counts(self.weights[:, items])
+
+    @cached_property
+    def _gains(self) -> np.ndarray:
+        return self.weights * self._arrived
 
     @property
     def _arrived(self) -> np.ndarray:
@@ -125,7 +130,7 @@ class Binomial:
         with np.errstate(divide="ignore"):
             return np.where(positive, -np.expm1(n * np.log1p(-µ)) / (n * µ), 1.0)
 
-    def take(self, items: np.ndarray) -> Binomial:
+    def take(self, items: np.ndarray | slice) -> Binomial:
         """Return the distributions of some items."""
         return Binomial(self.senders, self.link[items])
 
@@ -155,9 +160,13 @@ def like_senders(senders: int, link: np.ndarray) -> Arrivals:
     """
     if senders > SUM_UP_TO:
         return Binomial(senders, link)
-    m = np.arange(senders + 1)[:, None]
-    coefficients = np.array([[float(comb(senders, i))] for i in range(senders + 1)])
-    weights = coefficients * link**m * (1.0 - link) ** (senders - m)
+    weights = np.ones((senders + 1, len(link)))
+    heard, missed = np.ones(len(link)), np.ones(len(link))
+    for m in range(1, senders + 1):
+        heard = heard * link
+        missed = missed * (1.0 - link)
+        weights[m] *= float(comb(senders, m)) * heard
+        weights[senders - m] *= missed
     return Counts(weights / weights.sum(axis=0))
 
 

@@ -22,6 +22,8 @@ import numpy as np
 from stochfuse.arrivals import Arrivals
 from stochfuse.kalman import Estimate, predict
 
+_TINY = 1e-300
+
 
 @lru_cache(maxsize=64)
 def triangle(d: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -82,13 +84,12 @@ def update_measurement_space(stacked: np.ndarray, d: int, p: int, arrivals: Arri
     prior, AP, S = stacked[:n], stacked[n : n + p * d].reshape(p, d, -1), stacked[n + p * d :]
     s, W = _diagonalise(S, AP, p)
     g = arrivals.gained(s)
-    left = (1.0 - s * g).min(axis=0)
     rows, columns, _ = triangle(d)
     gW = g[:, None, :] * W
     P = prior - gW[0, rows] * W[0, columns]
-    for i in range(1, p):
-        P -= gW[i, rows] * W[i, columns]
-    return P, left
+    for j in range(1, p):
+        P -= gW[j, rows] * W[j, columns]
+    return P, 1.0 - (s * g).max(axis=0)
 
 
 def _diagonalise(S: np.ndarray, AP: np.ndarray, p: int) -> tuple[np.ndarray, np.ndarray]:
@@ -97,11 +98,11 @@ def _diagonalise(S: np.ndarray, AP: np.ndarray, p: int) -> tuple[np.ndarray, np.
         return np.maximum(S, 0.0), AP
     if p == 2:
         a, b, c = S
+        if not b.any():
+            return np.maximum(S[::2], 0.0), AP
         half = 0.5 * (c - a)
-        root = np.sqrt(half * half + b * b)
         # tan of the Jacobi angle, from the smaller rotation: no cancellation for near-equal eigenvalues
-        size = np.abs(half) + root
-        t = np.divide(np.copysign(b, half * b), size, out=np.zeros_like(b), where=size > 0)
+        t = np.copysign(b, half * b) / (np.abs(half) + np.sqrt(half * half + b * b) + _TINY)
         cos = 1.0 / np.sqrt(1.0 + t * t)
         sin = t * cos
         s = np.stack([a - t * b, c + t * b])

@@ -10,7 +10,7 @@ import numpy as np
 from stochfuse import simplified
 from stochfuse.checks import Checker
 from stochfuse.errors import UsageError
-from stochfuse.network import LinkRows, default_rows, uniform_rows
+from stochfuse.network import LinkRows, default_rows, stacked_rows, uniform_rows
 from stochfuse.prediction import Prediction
 from stochfuse.scenario import Scenario
 
@@ -85,12 +85,12 @@ def _rows(scenario: Scenario, link: Any) -> LinkRows:
     if array is not None and array.ndim <= 1 and array.size:
         array = np.atleast_1d(array)
         if array.min() >= 0 and array.max() <= 1:
-            return uniform_rows(array.tolist())
+            return uniform_rows(array)
         check.note("link", "probabilities between 0 and 1", f"{array.min() if array.min() < 0 else array.max():g}")
     elif array is not None and array.ndim == 3:
         matrices = [check.link("link", matrix, network.agents, network.steps) for matrix in array]
         if not check.problems:
-            return LinkRows(None, tuple(m for m in matrices if m is not None))
+            return stacked_rows(None, [m for m in matrices if m is not None], network)
     elif array is not None:
         check.note(
             "link",

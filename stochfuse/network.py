@@ -45,41 +45,47 @@ class LinkRows:
     Parameters
     ----------
     names : a name per row where rows are cases, else None.
-    arrays : per row a probability of shape (), (n, n), (steps,) or (steps, n, n).
+    link : probabilities of shape (rows,), (rows, steps), (rows, n, n) or (rows, steps, n, n).
     """
 
     names: tuple[str, ...] | None
-    arrays: tuple[np.ndarray, ...]
+    link: np.ndarray
 
     @property
     def uniform(self) -> bool:
         """Whether in every row all links of a step are equally likely."""
-        return all(a.ndim in (0, 1) for a in self.arrays)
+        return self.link.ndim <= 2
+
+    @property
+    def varies(self) -> bool:
+        """Whether the probabilities depend on the step."""
+        return self.link.ndim in (2, 4)
 
     def at_step(self, step: int) -> np.ndarray:
-        """Uniform link probability per row at a step, shape (rows,)."""
-        return np.array([float(a) if a.ndim == 0 else float(a[step - 1]) for a in self.arrays])
+        """Probabilities at a step, shape (rows,) if uniform, else (rows, receiver, sender)."""
+        return self.link[:, step - 1] if self.varies else self.link
 
     def matrices(self, network: Network, step: int) -> np.ndarray:
-        """Link probabilities from every possible sender at a step, shape (rows, receiver, sender)."""
-        n = network.agents
-        full = np.stack([_at(a, n, step) for a in self.arrays])
-        if network.architecture == "cyclic":
-            receivers = np.arange(n)
-            return full[:, receivers, (receivers + 1) % n][:, :, None][:, :, : min(1, n - 1)]
-        return full[:, ~np.eye(n, dtype=bool)].reshape(len(full), n, n - 1)
+        """Probabilities from every possible sender at a step, shape (rows, receiver, possible sender)."""
+        n, now = network.agents, self.at_step(step)
+        full = np.broadcast_to(now[:, None, None], (len(now), n, n)) if self.uniform else now
+        return np.take_along_axis(full, possible_senders(network.architecture, n)[None], axis=2)
 
     def means(self, network: Network) -> np.ndarray:
         """Link probability of each row, averaged over its possible links and over the steps, shape (rows,)."""
         if self.uniform:
-            return np.array([a.mean() for a in self.arrays])
-        steps = range(1, network.steps + 1)
+            return self.link.reshape(len(self.link), -1).mean(axis=1)
+        steps = range(1, network.steps + 1 if self.varies else 2)
         return np.mean([self.matrices(network, k).mean(axis=(1, 2)) for k in steps], axis=0)
 
 
-def _at(link: np.ndarray, agents: int, step: int) -> np.ndarray:
-    now = link[step - 1] if link.ndim in (1, 3) else link
-    return np.broadcast_to(now, (agents, agents))
+def stacked_rows(names: tuple[str, ...] | None, links: Sequence[np.ndarray], network: Network) -> LinkRows:
+    """Rows from probabilities of shape (), (n, n), (steps,) or (steps, n, n), which may be mixed."""
+    n, steps = network.agents, network.steps
+    matrix, varies = any(a.ndim >= 2 for a in links), any(a.ndim in (1, 3) for a in links)
+    shape = ((steps,) if varies else ()) + ((n, n) if matrix else ())
+    full = [a[:, None, None] if a.ndim == 1 and matrix else a for a in links]
+    return LinkRows(names, np.stack([np.broadcast_to(a, shape) for a in full]))
 
 
 def possible_senders(architecture: str, agents: int) -> np.ndarray:
@@ -99,12 +105,12 @@ def default_rows(network: Network) -> LinkRows:
     """Rows that a scenario asks for itself: its cases, its link probability, or the thesis' five."""
     if network.cases:
         names, arrays = zip(*network.cases, strict=True)
-        return LinkRows(names, arrays)
+        return stacked_rows(names, arrays, network)
     if network.link is not None:
-        return LinkRows(None, (network.link,))
+        return stacked_rows(None, [network.link], network)
     return uniform_rows(DEFAULT_LINKS)
 
 
-def uniform_rows(link: Sequence[float]) -> LinkRows:
+def uniform_rows(link: Sequence[float] | np.ndarray) -> LinkRows:
     """One row per link probability, the same for every link and step."""
-    return LinkRows(None, tuple(np.asarray(float(µ)) for µ in link))
+    return LinkRows(None, np.array(link, dtype=float))

@@ -74,11 +74,7 @@ def steady_state(scenario: Scenario, link: Sequence[float] | LinkRows | None = N
         link if isinstance(link, LinkRows) else default_rows(scenario.network) if link is None else uniform_rows(link)
     )
     sensors = scenario.sensors
-    if (
-        scenario.model.varies
-        or any(s.H.ndim + s.R.ndim > 4 for s in sensors)
-        or any(a.ndim in (1, 3) for a in rows.arrays)
-    ):
+    if scenario.model.varies or any(s.H.ndim + s.R.ndim > 4 for s in sensors) or rows.varies:
         raise UsageError("a steady state needs a model, sensors and links that do not vary with the step")
     brief = replace(scenario, network=replace(scenario.network, steps=2))
     parts, group_of, first = [], np.zeros(scenario.network.agents, dtype=int), 0
@@ -90,7 +86,7 @@ def steady_state(scenario: Scenario, link: Sequence[float] | LinkRows | None = N
             _require_detectable(scenario.model, group.case.sensor)
         P = _solve(group.case)
         residual, bound = _certify(group.case, P)
-        shape = (len(rows.arrays), group.columns)
+        shape = (len(rows.link), group.columns)
         parts.append((P.reshape(*shape, *P.shape[1:]), residual.reshape(shape), bound.reshape(shape)))
     P, residual, bound = (np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
     return SteadyState(rows.means(scenario.network), P, group_of, residual, bound)

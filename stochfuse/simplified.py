@@ -119,7 +119,7 @@ def covariances(scenario: Scenario, rows: LinkRows) -> Covariances:
     UsageError
         If messages are delayed, or unlike agents make too many outcomes.
     """
-    steps, links = scenario.network.steps, len(rows.arrays)
+    steps, links = scenario.network.steps, len(rows.link)
     group_of = np.zeros(scenario.network.agents, dtype=int)
     parts, forms, first = [], set(), 0
     for group in groups(scenario, rows):
@@ -128,7 +128,8 @@ def covariances(scenario: Scenario, rows: LinkRows) -> Covariances:
             forms |= {"square-root"} if cancelled.any() else set()
             forms |= {"measurement-space"} if not cancelled.all() else set()
         else:
-            P, _ = run(group.case, steps)
+            P = np.empty((steps, *scenario.P0.shape, group.case.items))
+            run(group.case, steps, P)
             forms.add("outcomes")
         d = P.shape[1]
         parts.append(P.reshape(steps, d, d, links, group.columns).transpose(3, 0, 4, 1, 2))
@@ -149,11 +150,8 @@ def departures(scenario: Scenario, rows: LinkRows) -> list[str]:
             "derivation, evaluated with the one possible sender of each agent"
         )
     if not rows.uniform:
-        masked = any(
-            ((m := rows.matrices(network, k)) == 0).any() and (m > 0).any()
-            for k in _distinct_steps(rows, network.steps)
-        )
-        if masked:
+        steps = range(1, network.steps + 1 if rows.varies else 2)
+        if any(((m := rows.matrices(network, k)) == 0).any() and (m > 0).any() for k in steps):
             notes.append(
                 "some links have probability 0: on a masked network (54) is an approximation outside its derivation, "
                 "evaluated with the possible senders of each agent"
@@ -171,7 +169,7 @@ def groups(scenario: Scenario, rows: LinkRows) -> list[Group]:
     if len(scenario.sensors) == 1 and rows.uniform:
         senders = number_of_senders(network.architecture, network.agents)
         arrivals = _per_step(rows, network.steps, lambda k: like_senders(senders, rows.at_step(k)))
-        case = Case(scenario.model, scenario.sensors[0], scenario.P0, shared, arrivals, len(rows.arrays))
+        case = Case(scenario.model, scenario.sensors[0], scenario.P0, shared, arrivals, len(rows.link))
         return [Group((tuple(range(network.agents)),), case)]
     matrices = dict(zip(steps, _per_step(rows, network.steps, lambda k: rows.matrices(network, k)), strict=True))
     kinds = np.asarray(scenario.sensor_of)
@@ -260,13 +258,8 @@ def _outcome_weights(heard: np.ndarray, sender_kinds: np.ndarray, counts: np.nda
     return _items(weights)
 
 
-def _distinct_steps(rows: LinkRows, steps: int) -> range:
-    varying = any(a.ndim in (1, 3) for a in rows.arrays)
-    return range(1, steps + 1) if varying else range(1, 2)
-
-
 def _per_step(rows: LinkRows, steps: int, make: Any) -> list[Any]:
     """One object per step, and the same object at every step where the links do not vary."""
-    if len(_distinct_steps(rows, steps)) == 1:
+    if not rows.varies:
         return [make(1)] * steps
     return [make(step) for step in range(1, steps + 1)]

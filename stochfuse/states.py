@@ -112,7 +112,7 @@ def _one_record(scenario: Scenario, rows: LinkRows, z: np.ndarray, printed: bool
         else:
             x = prior.x + mean_gain(prior.P, sensor, arrivals) @ (now - sensor.H @ prior.x)
         out.append(x)
-    by_group = np.stack(out).reshape(steps, len(rows.arrays), -1, d, 1).transpose(1, 0, 2, 3, 4)
+    by_group = np.stack(out).reshape(steps, len(rows.link), -1, d, 1).transpose(1, 0, 2, 3, 4)
     if by_group.shape[2] == 1:
         return np.broadcast_to(by_group, (*by_group.shape[:2], len(group_of), d, 1))
     return by_group[:, :, group_of]
@@ -146,7 +146,7 @@ def _own_records(scenario: Scenario, rows: LinkRows, z: np.ndarray) -> np.ndarra
         )
     P, group_of, _ = simplified.covariances(scenario, rows)
     senders = possible_senders(network.architecture, network.agents)
-    x = [np.broadcast_to(scenario.x0, (len(rows.arrays), d, 1))] * network.agents
+    x = [np.broadcast_to(scenario.x0, (len(rows.link), d, 1))] * network.agents
     out = [np.stack(x, axis=1)]
     for step in range(2, network.steps + 1):
         heard = rows.matrices(network, step)

@@ -19,6 +19,7 @@ ODD_H = np.array([[1.0, 0.3, -0.2, 0.1], [0.4, 0.0, 1.0, -0.7]])
 
 CASES = {
     "benign": (F, Q, H, 25 * np.eye(2), P0),
+    "scalar benign": (np.eye(1), 25 * np.eye(1), np.eye(1), 100 * np.eye(1), 100 * np.eye(1)),
     "R = 1e-4": (F, Q, H, 1e-4 * np.eye(2), P0),
     "R = 1e-8": (F, Q, H, 1e-8 * np.eye(2), P0),
     "R = 1e-14": (F, Q, H, 1e-14 * np.eye(2), P0),

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -32,6 +32,9 @@ from stochfuse.model import Model, Sensor, at_step
 
 CANCELLATION = 1e-5
 """Share of prior variance left by an update, below which the square-root form takes over: 1e-16/1e-5 of an entry."""
+
+BLOCK = 4096
+"""Items that are carried through all steps together: what a core's cache holds for a few states."""
 
 PRECISE = 1e6
 """Information gained in one step, relative to the prior's, above which unlike agents' updates go through an SVD."""
@@ -55,8 +58,8 @@ class Form(Protocol):
         """State after a step: predict, then the update averaged over arrivals."""
         ...
 
-    def covariance(self, carried: Carried) -> np.ndarray:
-        """Covariance of shape (d, d, items)."""
+    def covariance(self, carried: Carried, out: np.ndarray | None = None) -> np.ndarray:
+        """Covariance of shape (d, d, items), written into `out` if that is given."""
         ...
 
     def carry(self, P: np.ndarray) -> Carried:
@@ -88,21 +91,21 @@ class Case:
         """Share of P0 that the exchange at step 1 leaves, shape (items,): E[1/(m+1)], or 1 for one shared estimate."""
         return np.ones(self.items) if self.shared else self.arrivals[0].reciprocal()
 
-    def take(self, items: np.ndarray) -> Case:
+    def take(self, items: np.ndarray | slice) -> Case:
         """Return the same for some of the items."""
         chosen: dict[int, Arrivals] = {}
         for a in self.arrivals:
             chosen.setdefault(id(a), a.take(items))
-        return replace(self, arrivals=[chosen[id(a)] for a in self.arrivals], items=len(items))
+        return replace(self, arrivals=[chosen[id(a)] for a in self.arrivals], items=len(np.arange(self.items)[items]))
 
 
 class MeasurementSpace:
     """Upper triangles with the items in the last axis; see `stochfuse.averaged`."""
 
-    def __init__(self, case: Case):
+    def __init__(self, case: Case, maps: dict[int, Any] | None = None):
         self.case = case
         self._constant = not case.model.varies and case.sensor.H.ndim == case.sensor.R.ndim == 2
-        self._maps: dict[int, tuple[np.ndarray, np.ndarray, float]] = {}
+        self._maps: dict[int, tuple[np.ndarray, np.ndarray, float]] = {} if maps is None else maps
 
     def start(self) -> Carried:
         rows, columns, _ = triangle(self.case.model.dimension)
@@ -118,8 +121,8 @@ class MeasurementSpace:
         P, left = update_measurement_space(prior, d, self.case.sensor.H.shape[-2], arrivals)
         return Carried(P, np.minimum(carried.left, left))
 
-    def covariance(self, carried: Carried) -> np.ndarray:
-        return carried.value[triangle(self.case.model.dimension)[2]]
+    def covariance(self, carried: Carried, out: np.ndarray | None = None) -> np.ndarray:
+        return np.take(carried.value, triangle(self.case.model.dimension)[2], axis=0, out=out, mode="clip")
 
     def carry(self, P: np.ndarray) -> Carried:
         rows, columns, _ = triangle(self.case.model.dimension)
@@ -152,8 +155,8 @@ class SquareRoot:
         L = update_factor(prior, at_step(sensor.H, step), at_step(sensor.R, step), lambda s: arrivals.remaining(s.T).T)
         return Carried(L, carried.left)
 
-    def covariance(self, carried: Carried) -> np.ndarray:
-        return np.moveaxis(from_factor(carried.value), 0, -1)
+    def covariance(self, carried: Carried, out: np.ndarray | None = None) -> np.ndarray:
+        return _from_factors(carried.value, out)
 
     def carry(self, P: np.ndarray) -> Carried:
         return Carried(factor(P), np.ones(len(P)))
@@ -216,29 +219,39 @@ class Outcomes:
             posteriors.append(update_factor(prior, H, np.eye(len(H))) * np.sqrt(weight)[:, None, None])
         return join_factors(*posteriors)
 
-    def covariance(self, carried: Carried) -> np.ndarray:
-        return np.moveaxis(from_factor(carried.value), 0, -1)
+    def covariance(self, carried: Carried, out: np.ndarray | None = None) -> np.ndarray:
+        return _from_factors(carried.value, out)
 
     def carry(self, P: np.ndarray) -> Carried:
         return Carried(factor(P), np.ones(len(P)))
 
 
-def run(form: Form, steps: int) -> tuple[np.ndarray, np.ndarray]:
+def _from_factors(L: np.ndarray, out: np.ndarray | None) -> np.ndarray:
+    P = np.moveaxis(from_factor(L), 0, -1)
+    if out is None:
+        return P
+    out[...] = P
+    return out
+
+
+def run(form: Form, steps: int, out: np.ndarray) -> np.ndarray:
     """Carry a form through the steps.
+
+    Parameters
+    ----------
+    out : (steps, d, d, items), filled with the averaged posterior covariances.
 
     Returns
     -------
-    covariance : (steps, d, d, items) averaged posterior covariance.
-    left : (items,) smallest share of prior variance that any update left.
+    ndarray
+        (items,) smallest share of prior variance that any update left.
     """
     carried = form.start()
-    first = form.covariance(carried)
-    covariances = np.empty((steps, *first.shape))
-    covariances[0] = first
+    form.covariance(carried, out[0])
     for step in range(2, steps + 1):
         carried = form.advance(carried, step)
-        covariances[step - 1] = form.covariance(carried)
-    return covariances, carried.left
+        form.covariance(carried, out[step - 1])
+    return carried.left
 
 
 def run_like(case: Case, steps: int) -> tuple[np.ndarray, np.ndarray]:
@@ -249,10 +262,17 @@ def run_like(case: Case, steps: int) -> tuple[np.ndarray, np.ndarray]:
     covariance : (steps, d, d, items).
     cancelled : (items,) whether the square-root form was needed.
     """
+    d = case.model.dimension
+    covariances, left = np.empty((steps, d, d, case.items)), np.empty(case.items)
+    maps: dict[int, Any] = {}
     with np.errstate(all="ignore"):
-        covariances, left = run(MeasurementSpace(case), steps)
-    cancelled = ~(left > CANCELLATION) | ~np.isfinite(covariances).all(axis=(0, 1, 2))
+        for first in range(0, case.items, BLOCK):
+            block = np.s_[first : first + BLOCK]
+            left[block] = run(MeasurementSpace(case.take(block), maps), steps, covariances[..., block])
+    cancelled = ~(left > CANCELLATION) | ~np.isfinite(covariances[-1]).all(axis=(0, 1))
     if cancelled.any():
         again = np.flatnonzero(cancelled)
-        covariances[..., again] = run(SquareRoot(case.take(again)), steps)[0]
+        redone = np.empty((steps, d, d, len(again)))
+        run(SquareRoot(case.take(again)), steps, redone)
+        covariances[..., again] = redone
     return covariances, cancelled
