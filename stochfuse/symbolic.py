@@ -177,9 +177,8 @@ class SimplifiedForm:
             coefficients.append(_reduced(value, self.symbols))
         variable = MU if at == 0 else 1 - MU
         # unevaluated, since SymPy multiplies a number into 1 − µ
-        return sympy.Add(
-            *(sympy.Mul(c, variable**j, evaluate=False) for j, c in enumerate(coefficients)), evaluate=False
-        )
+        summands = [sympy.Mul(c, variable**j, evaluate=False) if j else c for j, c in enumerate(coefficients)]
+        return sympy.Add(*summands, evaluate=False)
 
     @cached_property
     def chain(self) -> tuple[tuple[sympy.Symbol, sympy.Expr], ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import Any, NamedTuple
 
 import sympy
@@ -63,7 +64,7 @@ def formulas(form: SimplifiedForm) -> list[Formula]:
 
 def to_plain(form: SimplifiedForm) -> str:
     """One `name = expression` per line, which SymPy can read back, with comments between."""
-    lines = [f"# {title(form)}"]
+    lines = textwrap.wrap(title(form), 100, initial_indent="# ", subsequent_indent="# ")
     for formula in formulas(form):
         lines += [f"# {formula.says}", f"{formula.name} = {formula.expression}"]
     return "\n".join(lines) + "\n"
@@ -71,8 +72,6 @@ def to_plain(form: SimplifiedForm) -> str:
 
 def to_pretty(form: SimplifiedForm, width: int) -> str:
     """Two-dimensional Unicode for a terminal."""
-    import textwrap
-
     blocks = [textwrap.fill(title(form), width)]
     for formula in formulas(form):
         equation = sympy.Eq(formula.name, formula.expression, evaluate=False)

@@ -47,7 +47,9 @@ def to_text(table: Table, width: int | None = 80) -> str:
     """Return the table for a terminal of some width; what does not fit beside is put below.  No width: one table."""
     output = io.StringIO()
     room = width or 1_000_000
-    console = Console(file=output, width=room, markup=False, highlight=False, emoji=False, color_system=None)
+    console = Console(
+        file=output, width=room, markup=False, highlight=False, emoji=False, color_system=None, force_jupyter=False
+    )
     for line in table.title:
         console.print(line, soft_wrap=width is None)
     for columns in _blocks(table, room):
