@@ -33,6 +33,7 @@ _NODES = np.exp(_X - np.exp(-_X))
 _WEIGHTS = _STEP * _NODES * (1.0 + np.exp(-_X))
 _TINY = 1e-290
 _BLOCK = 128
+_FEW = 8
 
 
 class Arrivals(Protocol):
@@ -92,6 +93,8 @@ class Counts:
 
     def _average(self, s: np.ndarray, numerator: np.ndarray) -> np.ndarray:
         noise = 1.0 / np.maximum(s, _TINY)
+        if len(numerator) <= _FEW:
+            return self._average_few(noise, numerator)
         columns = (-1, *(1,) * (noise.ndim - 1), numerator.shape[-1])
         total = np.zeros_like(noise)
         for first in range(0, len(numerator), _BLOCK):
@@ -99,6 +102,15 @@ class Counts:
             terms = np.add.outer(np.arange(first + 1.0, first + len(block) + 1), noise)
             total += np.divide(block, terms, out=terms).sum(axis=0)
         return total * noise
+
+    def _average_few(self, noise: np.ndarray, numerator: np.ndarray) -> np.ndarray:
+        """The same, term by term: for a few counts the three-dimensional arrays cost more than they save."""
+        total, term = np.zeros_like(noise), np.empty_like(noise)
+        for m, weight in enumerate(numerator):
+            np.add(noise, m + 1.0, out=term)
+            total += np.divide(weight, term, out=term)
+        total *= noise
+        return total
 
 
 @dataclass(frozen=True)

@@ -34,21 +34,25 @@ def triangle(d: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return rows, columns, place
 
 
-def linear_map(F: np.ndarray, whitened: np.ndarray) -> np.ndarray:
-    """Matrix that takes the upper triangle of P to those of F P Fᵀ, A F P Fᵀ and A F P FᵀAᵀ, stacked, with A = C⁻¹H.
-
-    It is read off the kernel's own `predict`, applied to a basis of the symmetric matrices.
-    """
-    d = F.shape[-1]
+@lru_cache(maxsize=64)
+def basis(d: int) -> np.ndarray:
+    """A basis of the symmetric d×d matrices, in the order of their upper triangle."""
     rows, columns, _ = triangle(d)
     basis = np.zeros((len(rows), d, d))
     basis[np.arange(len(rows)), rows, columns] = basis[np.arange(len(rows)), columns, rows] = 1.0
-    return _stack(predict(Estimate(None, basis), F, np.zeros_like(F)).P, whitened).T
+    basis.setflags(write=False)
+    return basis
 
 
-def offset(Q: np.ndarray, whitened: np.ndarray) -> np.ndarray:
-    """What Q adds to each row of `linear_map`, as a column."""
-    return _stack(Q[None], whitened).T
+def prior_map(F: np.ndarray, Q: np.ndarray, whitened: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix and constant that take the upper triangle of P to those of P⁻ = F P Fᵀ + Q, A P⁻ and A P⁻Aᵀ, stacked.
+
+    A = C⁻¹H is `whitened`.  The matrix is read off the kernel's own `predict`, applied to a basis of the symmetric
+    matrices; the constant is what Q adds.
+    """
+    moved = predict(Estimate(None, basis(F.shape[-1])), F, np.zeros_like(Q)).P
+    rows = _stack(np.concatenate([moved, Q[None]]), whitened)
+    return np.ascontiguousarray(rows[:-1].T), rows[-1:].T
 
 
 def _stack(P: np.ndarray, A: np.ndarray) -> np.ndarray:
@@ -59,9 +63,8 @@ def _stack(P: np.ndarray, A: np.ndarray) -> np.ndarray:
     return np.concatenate([P[:, rows, columns], AP.reshape(len(P), -1), S[:, p_rows, p_columns]], axis=1)
 
 
-def update_scalar(stacked: np.ndarray, J: float, arrivals: Arrivals) -> np.ndarray:
-    """P = P⁻ E(P⁻J) for a scalar state: P of shape (1, items) from the first row of `linear_map`'s stack."""
-    prior = stacked[:1]
+def update_scalar(prior: np.ndarray, J: float, arrivals: Arrivals) -> np.ndarray:
+    """P = P⁻ E(P⁻J) for a scalar state, shape (1, items), with J = HᵀR⁻¹H."""
     return prior * arrivals.remaining(prior * J)
 
 
@@ -70,7 +73,7 @@ def update_measurement_space(stacked: np.ndarray, d: int, p: int, arrivals: Arri
 
     Parameters
     ----------
-    stacked : (rows, items) the prior as `linear_map` and `offset` give it.
+    stacked : (rows, items) the prior as `prior_map` gives it.
     d, p : number of states and of measurements.
     arrivals : distribution of the number of messages, per item.
 
@@ -84,11 +87,15 @@ def update_measurement_space(stacked: np.ndarray, d: int, p: int, arrivals: Arri
     prior, AP, S = stacked[:n], stacked[n : n + p * d].reshape(p, d, -1), stacked[n + p * d :]
     s, W = _diagonalise(S, AP, p)
     g = arrivals.gained(s)
-    rows, columns, _ = triangle(d)
-    gW = g[:, None, :] * W
-    P = prior - gW[0, rows] * W[0, columns]
-    for j in range(1, p):
-        P -= gW[j, rows] * W[j, columns]
+    P = prior.copy()
+    product, first = np.empty((d, P.shape[1])), 0
+    for i in range(d):
+        # row i of the upper triangle: entries (i, i) … (i, d−1) lie side by side
+        row, some = P[first : first + d - i], product[: d - i]
+        for j in range(p):
+            np.multiply(g[j] * W[j, i], W[j, i:], out=some)
+            row -= some
+        first += d - i
     return P, 1.0 - (s * g).max(axis=0)
 
 

@@ -20,15 +20,20 @@ def at_step(matrix: np.ndarray, step: int) -> np.ndarray:
     return matrix if matrix.ndim == 2 else matrix[step - 1]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Sensor:
     """What an agent measures: H (p, d) and R (p, p), each constant or with a leading step axis."""
 
     H: np.ndarray
     R: np.ndarray
 
+    @property
+    def varies(self) -> bool:
+        """Whether H or R depends on the step."""
+        return max(self.H.ndim, self.R.ndim) > 2
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class Model:
     """How the state moves, and what its components are called.
 

@@ -74,7 +74,7 @@ class LinkRows:
     def means(self, network: Network) -> np.ndarray:
         """Link probability of each row, averaged over its possible links and over the steps, shape (rows,)."""
         if self.uniform:
-            return self.link.reshape(len(self.link), -1).mean(axis=1)
+            return self.link.mean(axis=1) if self.varies else self.link
         steps = range(1, network.steps + 1 if self.varies else 2)
         return np.mean([self.matrices(network, k).mean(axis=(1, 2)) for k in steps], axis=0)
 

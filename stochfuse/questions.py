@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stochfuse import simplified
-from stochfuse.averaged import triangle
+from stochfuse.averaged import basis, triangle
 from stochfuse.engines.mean_field import CANCELLATION, Case, Form, MeasurementSpace, Outcomes, SquareRoot
 from stochfuse.errors import NoAnswerError, UsageError
 from stochfuse.model import Model, Sensor
@@ -74,7 +74,7 @@ def steady_state(scenario: Scenario, link: Sequence[float] | LinkRows | None = N
         link if isinstance(link, LinkRows) else default_rows(scenario.network) if link is None else uniform_rows(link)
     )
     sensors = scenario.sensors
-    if scenario.model.varies or any(s.H.ndim + s.R.ndim > 4 for s in sensors) or rows.varies:
+    if scenario.model.varies or any(s.varies for s in sensors) or rows.varies:
         raise UsageError("a steady state needs a model, sensors and links that do not vary with the step")
     brief = replace(scenario, network=replace(scenario.network, steps=2))
     parts, group_of, first = [], np.zeros(scenario.network.agents, dtype=int), 0
@@ -176,9 +176,8 @@ def _newton_step(case: Case | Outcomes, P: np.ndarray, gP: np.ndarray) -> np.nda
     rows, columns, place = triangle(d)
     unit = _deviations(P)
     h = 1e-5
-    basis = np.zeros((len(rows), d, d))
-    basis[np.arange(len(rows)), rows, columns] = basis[np.arange(len(rows)), columns, rows] = h
-    moved = np.concatenate([P + basis[:, None] * unit, P - basis[:, None] * unit])
+    change = h * basis(d)[:, None] * unit
+    moved = np.concatenate([P + change, P - change])
     values = _apply(case.take(np.tile(np.arange(items), len(moved))), moved.reshape(-1, d, d))
     plus, minus = values.reshape(2, len(rows), items, d, d)
     slope = ((plus - minus) / (2 * h * unit))[:, :, rows, columns].transpose(1, 2, 0)

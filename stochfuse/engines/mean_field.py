@@ -13,12 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol
+from functools import lru_cache
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from stochfuse.arrivals import Arrivals
-from stochfuse.averaged import linear_map, offset, triangle, update_measurement_space, update_scalar
+from stochfuse.averaged import prior_map, triangle, update_measurement_space, update_scalar
 from stochfuse.kalman import (
     Information,
     factor,
@@ -102,23 +103,22 @@ class Case:
 class MeasurementSpace:
     """Upper triangles with the items in the last axis; see `stochfuse.averaged`."""
 
-    def __init__(self, case: Case, maps: dict[int, Any] | None = None):
+    def __init__(self, case: Case):
         self.case = case
-        self._constant = not case.model.varies and case.sensor.H.ndim == case.sensor.R.ndim == 2
-        self._maps: dict[int, tuple[np.ndarray, np.ndarray, float]] = {} if maps is None else maps
 
     def start(self) -> Carried:
         rows, columns, _ = triangle(self.case.model.dimension)
         return Carried(self.case.P0[rows, columns][:, None] * self.case.first_share(), np.ones(self.case.items))
 
     def advance(self, carried: Carried, step: int) -> Carried:
-        matrix, constant, J = self._map(step)
+        model, sensor = self.case.model, self.case.sensor
+        matrix, constant, J = _prior_map(model, sensor, step if model.varies or sensor.varies else 2)
         prior = matrix @ carried.value
         prior += constant
-        d, arrivals = self.case.model.dimension, self.case.arrivals[step - 1]
+        d, arrivals = model.dimension, self.case.arrivals[step - 1]
         if d == 1:
             return Carried(update_scalar(prior, J, arrivals), carried.left)
-        P, left = update_measurement_space(prior, d, self.case.sensor.H.shape[-2], arrivals)
+        P, left = update_measurement_space(prior, d, sensor.H.shape[-2], arrivals)
         return Carried(P, np.minimum(carried.left, left))
 
     def covariance(self, carried: Carried, out: np.ndarray | None = None) -> np.ndarray:
@@ -128,15 +128,15 @@ class MeasurementSpace:
         rows, columns, _ = triangle(self.case.model.dimension)
         return Carried(np.ascontiguousarray(P[:, rows, columns].T), np.ones(len(P)))
 
-    def _map(self, step: int) -> tuple[np.ndarray, np.ndarray, float]:
-        key = 0 if self._constant else step
-        if key not in self._maps:
-            model, sensor = self.case.model, self.case.sensor
-            F, Q, H, R = (at_step(M, step) for M in (model.F, model.Q, sensor.H, sensor.R))
-            C = np.linalg.cholesky(R)
-            whitened = np.linalg.solve(C, H)
-            self._maps[key] = linear_map(F, whitened), offset(Q, whitened), float(np.vdot(whitened, whitened))
-        return self._maps[key]
+
+@lru_cache(maxsize=1024)
+def _prior_map(model: Model, sensor: Sensor, step: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """`prior_map` of a step (a scalar state needs its first row only), and the information HᵀR⁻¹H of a scalar state."""
+    F, Q, H, R = (at_step(M, step) for M in (model.F, model.Q, sensor.H, sensor.R))
+    whitened = np.linalg.solve(np.linalg.cholesky(R), H)
+    matrix, constant = prior_map(F, Q, whitened)
+    rows = 1 if model.dimension == 1 else len(matrix)
+    return matrix[:rows], constant[:rows], float(np.vdot(whitened, whitened))
 
 
 class SquareRoot:
@@ -264,11 +264,11 @@ def run_like(case: Case, steps: int) -> tuple[np.ndarray, np.ndarray]:
     """
     d = case.model.dimension
     covariances, left = np.empty((steps, d, d, case.items)), np.empty(case.items)
-    maps: dict[int, Any] = {}
     with np.errstate(all="ignore"):
         for first in range(0, case.items, BLOCK):
             block = np.s_[first : first + BLOCK]
-            left[block] = run(MeasurementSpace(case.take(block), maps), steps, covariances[..., block])
+            part = case if case.items <= BLOCK else case.take(block)
+            left[block] = run(MeasurementSpace(part), steps, covariances[..., block])
     cancelled = ~(left > CANCELLATION) | ~np.isfinite(covariances[-1]).all(axis=(0, 1))
     if cancelled.any():
         again = np.flatnonzero(cancelled)
