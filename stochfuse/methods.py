@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from stochfuse import simplified
-from stochfuse.checks import Checker
 from stochfuse.errors import UsageError
-from stochfuse.network import LinkRows, default_rows, stacked_rows, uniform_rows
 from stochfuse.prediction import Prediction
-from stochfuse.scenario import Scenario
+from stochfuse.scenario import Scenario, link_rows
 
 METHODS = ("simplified",)
 QUANTITIES = ("claimed",)
@@ -50,7 +47,7 @@ def predict(
     """
     _choose("method", method, METHODS)
     _choose("quantity", quantity, QUANTITIES)
-    rows = default_rows(scenario.network) if link is None else _rows(scenario, link)
+    rows = link_rows(scenario, link)
     result = simplified.covariances(scenario, rows)
     prediction = Prediction(
         scenario=scenario,
@@ -77,24 +74,3 @@ def predict(
 def _choose(name: str, value: str, choices: Sequence[str]) -> None:
     if value not in choices:
         raise UsageError(f"{name}: expected one of {', '.join(choices)}, got '{value}'")
-
-
-def _rows(scenario: Scenario, link: Any) -> LinkRows:
-    network, check = scenario.network, Checker()
-    array = check.array("link", link, "link probabilities, or one matrix of them per row")
-    if array is not None and array.ndim <= 1 and array.size:
-        array = np.atleast_1d(array)
-        if array.min() >= 0 and array.max() <= 1:
-            return uniform_rows(array)
-        check.note("link", "probabilities between 0 and 1", f"{array.min() if array.min() < 0 else array.max():g}")
-    elif array is not None and array.ndim == 3:
-        matrices = [check.link("link", matrix, network.agents, network.steps) for matrix in array]
-        if not check.problems:
-            return stacked_rows(None, [m for m in matrices if m is not None], network)
-    elif array is not None:
-        check.note(
-            "link",
-            f"link probabilities, or one {network.agents}×{network.agents} matrix of them per row",
-            f"an array of shape {array.shape}",
-        )
-    raise UsageError("; ".join(map(str, check.problems)))

@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 
 from stochfuse.checks import Checker, shown
-from stochfuse.errors import Problem, ScenarioError
+from stochfuse.errors import Problem, ScenarioError, UsageError
 from stochfuse.model import Model, Sensor
-from stochfuse.network import ARCHITECTURES, Network
+from stochfuse.network import ARCHITECTURES, LinkRows, Network, default_rows, stacked_rows, uniform_rows
 
 SCHEMA = "stochfuse.scenario/1"
 DEFAULT = "thesis-transient"
@@ -109,6 +109,37 @@ def load_scenario(source: str | Path = DEFAULT, **overrides: Any) -> Scenario:
         # the presets' structure is checked by the tests; pydantic would double the time of a plain `predict`
         return _build(mapping, name, [])
     return Scenario.from_mapping(mapping, name)
+
+
+def link_rows(scenario: Scenario, link: Any = None) -> LinkRows:
+    """Return the rows of link probability that a caller asks for, checked.
+
+    Parameters
+    ----------
+    link : link probabilities, one row each; or an array of shape (rows, agents, agents), one matrix each.  Default: the
+        scenario's cases, else its link, else 0, 0.25, 0.5, 0.75 and 1.
+
+    Raises
+    ------
+    UsageError
+        If they are no probabilities or do not fit the agents.
+    """
+    network, check = scenario.network, Checker()
+    if link is None:
+        return default_rows(network)
+    expected = f"link probabilities, or one {network.agents}×{network.agents} matrix of them per row"
+    array = check.array("link", link, expected)
+    if array is not None and array.ndim <= 1 and array.size:
+        if array.min() >= 0 and array.max() <= 1:
+            return uniform_rows(np.atleast_1d(array))
+        check.note("link", "probabilities between 0 and 1", f"{array.min() if array.min() < 0 else array.max():g}")
+    elif array is not None and array.ndim == 3 and array.size:
+        matrices = [check.link("link", matrix, network.agents, network.steps) for matrix in array]
+        if not check.problems:
+            return stacked_rows(None, [m for m in matrices if m is not None], network)
+    elif array is not None:
+        check.note("link", expected, f"an array of shape {array.shape}")
+    raise UsageError("; ".join(map(str, check.problems)))
 
 
 def is_preset(source: str | Path) -> bool:

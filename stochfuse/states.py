@@ -24,8 +24,8 @@ from stochfuse.engines.mean_field import Case
 from stochfuse.errors import UsageError
 from stochfuse.kalman import Estimate, predict, to_information, update
 from stochfuse.model import Sensor, at_step
-from stochfuse.network import LinkRows, default_rows, possible_senders, uniform_rows
-from stochfuse.scenario import Scenario
+from stochfuse.network import LinkRows, possible_senders
+from stochfuse.scenario import Scenario, link_rows
 
 MOST_AGENTS = 12
 """Agents up to which records of their own are averaged over all sets of senders."""
@@ -70,7 +70,7 @@ def predict_states(
     UsageError
         If the record does not fit the scenario.
     """
-    rows = default_rows(scenario.network) if link is None else uniform_rows(link)
+    rows = link_rows(scenario, link)
     z = np.asarray(measurements, dtype=float)
     steps, n = scenario.network.steps, scenario.network.agents
     widths = {sensor.H.shape[-2] for sensor in scenario.sensors}

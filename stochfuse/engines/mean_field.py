@@ -37,6 +37,9 @@ CANCELLATION = 1e-5
 BLOCK = 4096
 """Items that are carried through all steps together: what a core's cache holds for a few states."""
 
+ELEMENTS = 4_000_000
+"""Matrix elements over which unlike agents' outcomes are averaged at a time, to bound memory."""
+
 PRECISE = 1e6
 """Information gained in one step, relative to the prior's, above which unlike agents' updates go through an SVD."""
 
@@ -205,19 +208,25 @@ class Outcomes:
         nothing = Information(None, np.zeros_like(prior))
         gained = np.stack([update_information(nothing, s.H @ prior, s.R).Y for s in sensors])
         weights = self.weights[step - 1]
-        total = np.tensordot(self.counts.astype(float), gained, axes=1)
-        if np.trace(total, axis1=-2, axis2=-1).max() > PRECISE:
+        if (self.counts @ np.trace(gained, axis1=-2, axis2=-1)).max() > PRECISE:
             return Carried(self._precise(prior, sensors, weights), carried.left)
-        left = np.linalg.inv(np.eye(self.model.dimension) + total)
-        return Carried(prior @ factor(np.einsum("ci,cijk->ijk", weights, left)), carried.left)
+        left, nothing_gained = np.zeros_like(prior), np.eye(self.model.dimension)
+        block = max(1, ELEMENTS // prior.size)
+        for first in range(0, len(self.counts), block):
+            some = np.s_[first : first + block]
+            total = np.tensordot(self.counts[some].astype(float), gained, axes=1)
+            left += np.einsum("ci,cijk->ijk", weights[some], np.linalg.inv(nothing_gained + total))
+        return Carried(prior @ factor(left), carried.left)
 
     def _precise(self, prior: np.ndarray, sensors: list[Sensor], weights: np.ndarray) -> np.ndarray:
         whitened = [np.linalg.solve(np.linalg.cholesky(s.R), s.H) for s in sensors]
-        posteriors = []
+        joined, waiting = [], []
         for count, weight in zip(self.counts, weights, strict=True):
             H = np.concatenate([np.sqrt(c) * W for c, W in zip(count, whitened, strict=True)])
-            posteriors.append(update_factor(prior, H, np.eye(len(H))) * np.sqrt(weight)[:, None, None])
-        return join_factors(*posteriors)
+            waiting.append(update_factor(prior, H, np.eye(len(H))) * np.sqrt(weight)[:, None, None])
+            if len(waiting) == 64:
+                joined, waiting = [join_factors(*joined, *waiting)], []
+        return join_factors(*joined, *waiting)
 
     def covariance(self, carried: Carried, out: np.ndarray | None = None) -> np.ndarray:
         return _from_factors(carried.value, out)
