@@ -8,7 +8,7 @@ by central differences over a basis of the symmetric matrices (one batched call)
 The answer carries its own proof.  By monotonicity, g(P₋) ≥ P₋ puts the fixed point above P₋ and g(P₊) ≤ P₊ below P₊, in
 the positive-definite order; P₋ = (1−ε)P and P₊ = (1+ε)P are tried for ε = 1e-12, 1e-11, … and the first ε that brackets
 is reported as the relative bound.  A bracket counts only if it holds by more than rounding can do: by `ROUNDING`, in
-units of the states' standard deviations, with g evaluated in square-root form, whose error is below 1e-14 in those units.
+units of the states' standard deviations, with g evaluated in square-root form, whose error there is below 1e-14.
 """
 
 from __future__ import annotations
