@@ -154,23 +154,45 @@ def update_information(
 def factor(P: np.ndarray) -> np.ndarray:
     """Square root L of a positive semi-definite P, P = L Lᵀ, for stacks (..., d, d), singular ones included.
 
-    The matrix is scaled to unit diagonal first, so that the error is small in units of each state's own
-    standard deviation, whatever their ratio.
+    Cholesky's decomposition, the largest remaining variance first: exact to rounding in units of each state's own
+    standard deviation, and small independent errors stay in columns of their own.
     """
-    scale = np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
-    safe = np.where(scale > 0, scale, 1.0)
-    eigenvalues, V = np.linalg.eigh(P / (safe[..., :, None] * safe[..., None, :]))
-    return scale[..., :, None] * V * np.sqrt(np.maximum(eigenvalues, 0.0))[..., None, :]
+    rest = np.array(P, dtype=float)
+    d = rest.shape[-1]
+    L = np.zeros_like(rest)
+    negligible = 2e-16 * d * np.diagonal(rest, axis1=-2, axis2=-1)
+    for column in range(d):
+        variances = np.diagonal(rest, axis1=-2, axis2=-1)
+        variances = np.where(variances > negligible, variances, 0.0)
+        pivot = variances.argmax(axis=-1)[..., None]
+        variance = np.take_along_axis(variances, pivot, axis=-1)
+        chosen = np.take_along_axis(rest, pivot[..., None], axis=-1)[..., 0]
+        safe = np.sqrt(np.where(variance > 0, variance, 1.0))
+        L[..., column] = np.where(variance > 0, chosen / safe, 0.0)
+        rest -= L[..., :, None, column] * L[..., None, :, column]
+        np.put_along_axis(rest, np.broadcast_to(pivot[..., None], (*rest.shape[:-1], 1)), 0.0, axis=-1)
+        np.put_along_axis(rest, np.broadcast_to(pivot[..., None], (*rest.shape[:-2], 1, d)), 0.0, axis=-2)
+    return L
 
 
 def join_factors(*blocks: np.ndarray) -> np.ndarray:
-    """Square factor, shape (..., d, d), of Σ B Bᵀ over blocks B of shape (..., d, any), by QR: nothing is squared."""
+    """Square factor, shape (..., d, d), of Σ B Bᵀ over blocks B of shape (..., d, any); nothing is squared.
+
+    Reflections bring the sources of error (the columns) together, the largest first, for the states in the order of their
+    size (Powell and Reid): that keeps the relative accuracy of small sources beside large ones, which a library's QR decomposition does not.
+    """
     batch = np.broadcast_shapes(*(block.shape[:-2] for block in blocks))
     stacked = np.concatenate([np.broadcast_to(b, batch + b.shape[-2:]) for b in blocks], axis=-1)
     d, columns = stacked.shape[-2:]
     if columns < d:
         stacked = np.concatenate([stacked, np.zeros((*batch, d, d - columns))], axis=-1)
-    return np.swapaxes(np.linalg.qr(np.swapaxes(stacked, -1, -2), mode="r"), -1, -2)
+    order = np.argsort(-(stacked * stacked).sum(axis=-1), axis=-1, kind="stable")[..., None]
+    stacked = np.take_along_axis(stacked, order, axis=-2)
+    for i in range(d):
+        _turn_onto_column(i, stacked)
+    L = np.empty((*batch, d, d))
+    np.put_along_axis(L, np.broadcast_to(order, L.shape), stacked[..., :d], axis=-2)
+    return L
 
 
 def predict_factor(L: np.ndarray, F: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -183,30 +205,92 @@ def update_factor(
 ) -> np.ndarray:
     """Square-root form of (26), without an inverse and without a subtraction.
 
-    With R^(−½) H L = U Σ Vᵀ the posterior factor is L V diag(√shrink(σ²), 1, …).
+    With R = C Cᵀ and C⁻¹H L = U Σ Vᵀ the posterior factor is L V diag(√shrink(σ²), 1, …).
+
+    U comes from one-sided Jacobi rotations and V from Householder reflections that are applied to L one after the other, the
+    largest component first.  A general SVD knows V to rounding only; a reflection keeps the *relative* size of its small
+    components, and with them states that are known a trillion times better than they were before the measurement.
 
     Parameters
     ----------
     L : (..., d, d) factor of the prior covariance.
-    H, R : measurement matrix (p, d) and noise covariance (p, p), positive definite.
+    H, R : measurement matrix (..., p, d) and noise covariance (..., p, p), positive definite.
     shrink : what remains of the prior variance in a direction whose signal-to-noise ratio is s = σ²;
         takes and returns arrays of shape (..., min(p, d)).  One measurement, the default, leaves 1/(1 + s).
     """
+    d = L.shape[-1]
     whitened = np.linalg.solve(np.linalg.cholesky(R), H)
-    U, sigma, Vt = np.linalg.svd(whitened @ L, full_matrices=True)
-    k = sigma.shape[-1]
-    U, V = U[..., :k], np.swapaxes(Vt, -1, -2)
-    left = np.ones((*sigma.shape[:-1], L.shape[-1]))
+    rows, turned = _orthogonal_rows(whitened @ L, whitened)
+    k = min(rows.shape[-2], d)
+    sigma = np.sqrt((rows[..., :k, :] ** 2).sum(axis=-1))
+    L = np.broadcast_to(L, (*rows.shape[:-2], d, d)).copy()
+    for i in range(k):
+        _turn_onto_column(i, rows, L)
+        rows[..., i + 1 :, i] = 0.0  # the rows are orthogonal
+    _show_exactly(turned[..., :k, :], L, sigma)
+    left = np.ones((*sigma.shape[:-1], d))
     left[..., :k] = np.sqrt(shrink(sigma**2))
-    posterior = L @ V * left[..., None, :]
-    # V is orthogonal to rounding only, which in a direction measured with σ = 1e8 is an error of σ·1e-16: the posterior
-    # must show the sensor exactly UΣ√shrink, and what differs is taken out along the measured directions
-    shown = np.zeros((*sigma.shape[:-1], H.shape[-2], L.shape[-1]))
-    shown[..., :k] = U * (sigma * left[..., :k])[..., None, :]
-    strong = sigma > 1e-3 * np.maximum(sigma[..., :1], 1e3)
-    inverse = np.where(strong, 1.0 / np.where(strong, sigma, 1.0), 0.0)
-    excess = np.swapaxes(U, -1, -2) @ (whitened @ posterior - shown)
-    return posterior - L @ V[..., :k] @ (inverse[..., None] * excess)
+    return L * left[..., None, :]
+
+
+def _show_exactly(turned: np.ndarray, L: np.ndarray, sigma: np.ndarray) -> None:
+    """Take out of L, in place, what rounding left of it in measured directions where Uᵀ C⁻¹H L should be 0.
+
+    A state that is measured by itself with σ = 1e8 would otherwise keep an error of 1e-16·σ.  Where the product is itself
+    no more than rounding, there is nothing to take out.
+    """
+    k = sigma.shape[-1]
+    excess = turned @ L
+    shown = excess[..., np.arange(k), np.arange(k), None].copy()
+    excess[..., np.arange(k), np.arange(k)] = 0.0
+    noise = 1e-15 * (np.abs(turned) @ np.abs(L))
+    strong = (sigma > 1e3)[..., None] & (np.abs(excess) > noise)
+    weights = np.where(strong, excess / np.where(shown != 0, shown, 1.0), 0.0)
+    L -= L[..., :k] @ weights
+
+
+def _orthogonal_rows(A: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """UᵀA with orthogonal rows, the longest first, and UᵀW; U a product of Jacobi rotations.  A, W of shape (..., p, d)."""
+    p, d = A.shape[-2:]
+    both = np.concatenate([A, np.broadcast_to(W, (*A.shape[:-2], *W.shape[-2:]))], axis=-1)
+    for _ in range(12 if p > 1 else 0):
+        largest = 0.0
+        for i in range(p - 1):
+            for j in range(i + 1, p):
+                x, y = both[..., i, :], both[..., j, :]
+                a, c = (x[..., :d] ** 2).sum(axis=-1), (y[..., :d] ** 2).sum(axis=-1)
+                b = (x[..., :d] * y[..., :d]).sum(axis=-1)
+                size = np.sqrt(a) * np.sqrt(c)
+                largest = max(largest, float(np.divide(np.abs(b), size, out=np.zeros_like(b), where=size > 0).max()))
+                half = 0.5 * (c - a)
+                t = np.copysign(b, half * b) / (np.abs(half) + np.sqrt(half * half + b * b) + 1e-300)
+                cos = (1.0 / np.sqrt(1.0 + t * t))[..., None]
+                sin = t[..., None] * cos
+                both[..., i, :], both[..., j, :] = cos * x - sin * y, sin * x + cos * y
+        if largest < 1e-15:
+            break
+    order = np.argsort(-(both[..., :d] ** 2).sum(axis=-1), axis=-1, kind="stable")
+    both = np.take_along_axis(both, order[..., None], axis=-2)
+    return both[..., :d].copy(), both[..., d:]
+
+
+def _turn_onto_column(i: int, rows: np.ndarray, *others: np.ndarray) -> None:
+    """Reflect, in place, so that row i of `rows` has all its length from column i on in column i; and `others` with it."""
+    pivot = (i + np.abs(rows[..., i, i:]).argmax(axis=-1))[..., None, None]
+    for M in (rows, *others):
+        index = np.broadcast_to(pivot, (*M.shape[:-1], 1))
+        chosen = np.take_along_axis(M, index, axis=-1)
+        np.put_along_axis(M, index, M[..., i : i + 1].copy(), axis=-1)
+        M[..., i : i + 1] = chosen
+    v = rows[..., i, i:].copy()
+    largest = np.abs(v).max(axis=-1, keepdims=True)
+    v /= np.where(largest > 0, largest, 1.0)
+    v[..., 0] += np.copysign(np.sqrt((v * v).sum(axis=-1)), v[..., 0])
+    square = (v * v).sum(axis=-1)
+    scale = np.divide(2.0, square, out=np.zeros_like(square), where=square > 0)
+    for M in (rows[..., i:, i:], *(other[..., :, i:] for other in others)):
+        M -= (scale[..., None] * (M @ v[..., None])[..., 0])[..., None] * v[..., None, :]
+    rows[..., i, i + 1 :] = 0.0
 
 
 def from_factor(L: np.ndarray) -> np.ndarray:

@@ -40,7 +40,7 @@ BLOCK = 4096
 ELEMENTS = 4_000_000
 """Matrix elements over which unlike agents' outcomes are averaged at a time, to bound memory."""
 
-PRECISE = 1e6
+PRECISE = 1e4
 """Information gained in one step, relative to the prior's, above which unlike agents' updates go through an SVD."""
 
 

@@ -52,20 +52,21 @@ def to_text(table: Table, width: int | None = 80) -> str:
     )
     for line in table.title:
         console.print(line, soft_wrap=width is None)
-    for columns in _blocks(table, room):
-        rich = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1), show_edge=True)
+    text = [key and not all(_numeric(row[i]) for row in table.rows) for i, key in enumerate(_is_key(table))]
+    for columns in _blocks(table, text, room):
+        rich = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1))
         for index in columns:
-            key = index < len(table.keys)
-            text = key and not all(_numeric(row[index]) for row in table.rows)
+            # a number must never be cut: it keeps its width whatever the terminal; words may wrap
             rich.add_column(
                 table.headings[index],
-                justify="left" if text or not table.columns else "right",
-                no_wrap=not text,
+                justify="left" if text[index] or not table.columns else "right",
+                no_wrap=not text[index],
                 overflow="fold",
+                min_width=_width(table, index) if not text[index] else _longest_word(table, index),
             )
         for row in table.rows:
             rich.add_row(*(row[index] for index in columns))
-        console.print(rich)
+        console.print(rich, crop=False, no_wrap=False)
     return "\n".join(line.rstrip() for line in output.getvalue().split("\n")).rstrip("\n") + "\n"
 
 
@@ -77,11 +78,30 @@ def _numeric(cell: str) -> bool:
     return True
 
 
-def _blocks(table: Table, room: int) -> Iterator[list[int]]:
+def _is_key(table: Table) -> list[bool]:
+    return [i < len(table.keys) for i in range(len(table.headings))]
+
+
+def _width(table: Table, index: int) -> int:
+    return max(len(row[index]) for row in (table.headings, *table.rows))
+
+
+def _longest_word(table: Table, index: int) -> int:
+    return max((len(word) for row in (table.headings, *table.rows) for word in row[index].split()), default=0)
+
+
+def _blocks(table: Table, text: Sequence[bool], room: int) -> Iterator[list[int]]:
     """Column indices of each block, keys repeated; at least one further column a block."""
-    widths = [max(len(row[i]) for row in (table.headings, *table.rows)) + 2 for i in range(len(table.headings))]
+    beside = 3  # what rich puts around a cell
+    widths = [beside + (_longest_word if text[i] else _width)(table, i) for i in range(len(table.headings))]
     keys = list(range(len(table.keys)))
     start = used = sum(widths[i] for i in keys)
+    # words wrap only where even one further column would not fit beside them unwrapped
+    for i in keys:
+        whole = beside + _width(table, i)
+        if start + whole - widths[i] + max(widths[len(keys) :], default=0) <= room:
+            start = used = start + whole - widths[i]
+            widths[i] = whole
     block = list(keys)
     for i in range(len(keys), len(widths)):
         if used + widths[i] > room and len(block) > len(keys):
