@@ -116,6 +116,24 @@ def _diagonalise(S: np.ndarray, AP: np.ndarray, p: int) -> tuple[np.ndarray, np.
         W = np.stack([cos * AP[0] - sin * AP[1], sin * AP[0] + cos * AP[1]])
         return np.maximum(s, 0.0), W
     place = triangle(p)[2]
-    s, U = np.linalg.eigh(np.moveaxis(S[place], -1, 0))
+    usable = np.isfinite(S).all(axis=0)
+    s, U = np.linalg.eigh(np.moveaxis(np.where(usable, S, 0.0)[place], -1, 0))
     W = np.einsum("bqj,qdb->jdb", U, AP)
-    return np.maximum(s.T, 0.0), W
+    return np.where(usable, np.maximum(s.T, 0.0), np.nan), W
+
+
+def smallest_pivot(P: np.ndarray, d: int) -> np.ndarray:
+    """Smallest conditional variance of a state given those before it, relative to its variance, shape (items,).
+
+    P is given by its upper triangle, (d(d+1)/2, items).  The smaller, the more of the small directions of P is rounding
+    that an earlier, larger P left behind.
+    """
+    rest = P[triangle(d)[2]]
+    variances = rest[np.arange(d), np.arange(d)].copy()
+    smallest = np.ones(P.shape[1])
+    for i in range(d):
+        pivot = rest[i, i]
+        smallest = np.minimum(smallest, pivot / np.where(variances[i] > 0, variances[i], 1.0))
+        column = rest[i + 1 :, i] / np.where(pivot > 0, pivot, np.nan)
+        rest[i + 1 :, i + 1 :] -= column[:, None] * rest[i, None, i + 1 :]
+    return smallest

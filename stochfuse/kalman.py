@@ -178,8 +178,9 @@ def factor(P: np.ndarray) -> np.ndarray:
 def join_factors(*blocks: np.ndarray) -> np.ndarray:
     """Square factor, shape (..., d, d), of Σ B Bᵀ over blocks B of shape (..., d, any); nothing is squared.
 
-    Reflections bring the sources of error (the columns) together, the largest first, for the states in the order of their
-    size (Powell and Reid): that keeps the relative accuracy of small sources beside large ones, which a library's QR decomposition does not.
+    Reflections bring the sources of error (the columns) together, the largest first, for the states in the order of
+    their size (Powell and Reid): that keeps the relative accuracy of small sources beside large ones, which a
+    library's QR decomposition does not.
     """
     batch = np.broadcast_shapes(*(block.shape[:-2] for block in blocks))
     stacked = np.concatenate([np.broadcast_to(b, batch + b.shape[-2:]) for b in blocks], axis=-1)
@@ -207,9 +208,9 @@ def update_factor(
 
     With R = C Cᵀ and C⁻¹H L = U Σ Vᵀ the posterior factor is L V diag(√shrink(σ²), 1, …).
 
-    U comes from one-sided Jacobi rotations and V from Householder reflections that are applied to L one after the other, the
-    largest component first.  A general SVD knows V to rounding only; a reflection keeps the *relative* size of its small
-    components, and with them states that are known a trillion times better than they were before the measurement.
+    U comes from one-sided Jacobi rotations and V from Householder reflections that are applied to L one after the
+    other, the largest component first.  A general SVD knows V to rounding only; a reflection keeps the *relative* size
+    of its small components, and with them states that are known a trillion times better than they were before the measurement.
 
     Parameters
     ----------
@@ -236,8 +237,8 @@ def update_factor(
 def _show_exactly(turned: np.ndarray, L: np.ndarray, sigma: np.ndarray) -> None:
     """Take out of L, in place, what rounding left of it in measured directions where Uᵀ C⁻¹H L should be 0.
 
-    A state that is measured by itself with σ = 1e8 would otherwise keep an error of 1e-16·σ.  Where the product is itself
-    no more than rounding, there is nothing to take out.
+    A state that is measured by itself with σ = 1e8 would otherwise keep an error of 1e-16·σ.  Where the product is
+    itself no more than rounding, there is nothing to take out.
     """
     k = sigma.shape[-1]
     excess = turned @ L
@@ -250,7 +251,7 @@ def _show_exactly(turned: np.ndarray, L: np.ndarray, sigma: np.ndarray) -> None:
 
 
 def _orthogonal_rows(A: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """UᵀA with orthogonal rows, the longest first, and UᵀW; U a product of Jacobi rotations.  A, W of shape (..., p, d)."""
+    """UᵀA with orthogonal rows, the longest first, and UᵀW; U a product of Jacobi rotations, A, W (..., p, d)."""
     p, d = A.shape[-2:]
     both = np.concatenate([A, np.broadcast_to(W, (*A.shape[:-2], *W.shape[-2:]))], axis=-1)
     for _ in range(12 if p > 1 else 0):
@@ -275,7 +276,7 @@ def _orthogonal_rows(A: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _turn_onto_column(i: int, rows: np.ndarray, *others: np.ndarray) -> None:
-    """Reflect, in place, so that row i of `rows` has all its length from column i on in column i; and `others` with it."""
+    """Reflect in place: row i of `rows` gets its length from column i on into column i; `others` go with it."""
     pivot = (i + np.abs(rows[..., i, i:]).argmax(axis=-1))[..., None, None]
     for M in (rows, *others):
         index = np.broadcast_to(pivot, (*M.shape[:-1], 1))

@@ -73,6 +73,8 @@ class LinkRows:
 
     def means(self, network: Network) -> np.ndarray:
         """Link probability of each row, averaged over its possible links and over the steps, shape (rows,)."""
+        if number_of_senders(network.architecture, network.agents) == 0:
+            return np.zeros(len(self.link)) if not self.uniform else self.link.reshape(len(self.link), -1)[:, 0]
         if self.uniform:
             return self.link.mean(axis=1) if self.varies else self.link
         steps = range(1, network.steps + 1 if self.varies else 2)

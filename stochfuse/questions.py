@@ -30,6 +30,7 @@ from stochfuse.scenario import Scenario, link_rows
 TOLERANCE = 1e-12
 WARM_UP = 40
 ROUNDING = 1e-13
+STALLED = 1e-8
 NEWTON = 30
 PLAIN = 20_000
 
@@ -83,7 +84,7 @@ def steady_state(scenario: Scenario, link: Sequence[float] | LinkRows | None = N
             group_of[list(agents)] = column
         first += group.columns
         if isinstance(group.case, Case):
-            _require_detectable(scenario.model, group.case.sensor)
+            _require_detectable(scenario.model, group.case.sensor, scenario.P0)
         P = _solve(group.case)
         residual, bound = _certify(group.case, P)
         shape = (len(rows.link), group.columns)
@@ -92,13 +93,15 @@ def steady_state(scenario: Scenario, link: Sequence[float] | LinkRows | None = N
     return SteadyState(rows.means(scenario.network), P, group_of, residual, bound)
 
 
-def _require_detectable(model: Model, sensor: Sensor) -> None:
-    """Hautus test: every eigenvalue of F on or outside the unit circle must be observed."""
-    d = model.dimension
-    for eigenvalue in np.linalg.eigvals(model.F):
+def _require_detectable(model: Model, sensor: Sensor, P0: np.ndarray) -> None:
+    """Hautus test, in units of the states' deviations: every eigenvalue on or outside the unit circle is observed."""
+    sd = np.sqrt(np.diagonal(P0 + model.Q))
+    sd = np.where(sd > 0, sd, 1.0)
+    F, H = model.F * sd / sd[:, None], sensor.H * sd
+    H = H / np.maximum(np.linalg.norm(H, axis=1, keepdims=True), 1e-300)
+    for eigenvalue in np.linalg.eigvals(F):
         if abs(eigenvalue) >= 1.0 - 1e-9:
-            H = sensor.H / max(np.abs(sensor.H).max(), 1e-300)
-            hautus = np.concatenate([eigenvalue * np.eye(d) - model.F, H])
+            hautus = np.concatenate([eigenvalue * np.eye(len(F)) - F, H])
             if np.linalg.svd(hautus, compute_uv=False)[-1] < 1e-10 * max(1.0, abs(eigenvalue)):
                 raise NoAnswerError(
                     f"no steady state: the stand-alone filter does not converge, since the mode of F with eigenvalue "
@@ -136,7 +139,7 @@ def _residual(gP: np.ndarray, P: np.ndarray) -> np.ndarray:
 def _solve(case: Case | Outcomes) -> np.ndarray:
     items = case.items
     P = np.broadcast_to(case.P0 + np.eye(len(case.P0)) * np.trace(case.P0) * 1e-3, (items, *case.P0.shape))
-    steps = 0
+    steps, before = 0, np.inf
     while steps < PLAIN:
         for _ in range(WARM_UP):
             P = _apply(case, P)
@@ -144,12 +147,23 @@ def _solve(case: Case | Outcomes) -> np.ndarray:
         if not np.isfinite(P).all() or np.abs(P).max() > 1e200:
             break
         P, residual = _newton(case, P)
-        if (residual <= TOLERANCE).all():
+        P = _vanishing(case, P)
+        worst = float(residual.max())
+        if worst <= TOLERANCE or (worst <= STALLED and worst >= 0.5 * before):
             return P
+        before = worst
     raise NoAnswerError(
         f"no steady state: the averaged covariance does not settle within {PLAIN} steps; the links that are needed to "
         "observe every mode are too unlikely"
     )
+
+
+def _vanishing(case: Case | Outcomes, P: np.ndarray) -> np.ndarray:
+    """P, and 0 where it shrinks towards it without end: where there is no process noise, 0 reproduces itself."""
+    zero = np.zeros_like(P)
+    start = np.diagonal(case.P0).max() + np.finfo(float).tiny
+    gone = (_apply(case, zero) == 0).all(axis=(1, 2)) & (np.abs(P).max(axis=(1, 2)) < 1e-8 * start)
+    return np.where(gone[:, None, None], zero, P)
 
 
 def _newton(case: Case | Outcomes, P: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -196,7 +210,7 @@ def _newton_step(case: Case | Outcomes, P: np.ndarray, gP: np.ndarray) -> np.nda
 def _certify(case: Case | Outcomes, P: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Residual, and the smallest ε for which (1−ε)P and (1+ε)P bracket the fixed point."""
     form = SquareRoot(case) if isinstance(case, Case) else case
-    bound = np.full(len(P), np.inf)
+    bound = np.where((P == 0).all(axis=(1, 2)) & (_advance(form, P) == 0).all(axis=(1, 2)), 0.0, np.inf)
     for ε in 10.0 ** np.arange(-12, -1):
         low, high = (1 - ε) * P, (1 + ε) * P
         unit = _deviations(P)

@@ -22,7 +22,7 @@ from stochfuse import simplified
 from stochfuse.arrivals import Arrivals
 from stochfuse.engines.mean_field import Case
 from stochfuse.errors import UsageError
-from stochfuse.kalman import Estimate, predict, to_information, update
+from stochfuse.kalman import Estimate, factor, predict, to_information, update, update_factor
 from stochfuse.model import Sensor, at_step
 from stochfuse.network import LinkRows, possible_senders
 from stochfuse.scenario import Scenario, link_rows
@@ -150,7 +150,8 @@ def _own_records(scenario: Scenario, rows: LinkRows, z: np.ndarray) -> np.ndarra
     out = [np.stack(x, axis=1)]
     for step in range(2, network.steps + 1):
         heard = rows.matrices(network, step)
-        sensors = [_sensor(scenario.sensors[kind], step) for kind in scenario.sensor_of]
+        kinds = [_sensor(sensor, step) for sensor in scenario.sensors]
+        sensors = [(kinds[kind].H, kinds[kind].R) for kind in scenario.sensor_of]
         x = [
             _over_subsets(
                 _prior(scenario, x[i], P[:, step - 2, group_of[i]], step),
@@ -167,22 +168,24 @@ def _own_records(scenario: Scenario, rows: LinkRows, z: np.ndarray) -> np.ndarra
 
 
 def _over_subsets(
-    prior: Estimate, own: int, senders: np.ndarray, heard: np.ndarray, sensors: list[Sensor], z: np.ndarray
+    prior: Estimate,
+    own: int,
+    senders: np.ndarray,
+    heard: np.ndarray,
+    sensors: list[tuple[np.ndarray, np.ndarray]],
+    z: np.ndarray,
 ) -> np.ndarray:
-    total = np.zeros_like(prior.x)
+    total, start = np.zeros_like(prior.x), factor(prior.P)
     places = range(len(senders))
     for subset in chain.from_iterable(combinations(places, m) for m in range(len(senders) + 1)):
         inside = np.isin(places, subset)
-        weight = np.where(inside, heard, 1.0 - heard).prod(axis=1)
-        fused = [own, *senders[inside]]
-        R = np.zeros((sum(len(sensors[j].R) for j in fused),) * 2)
-        first = 0
-        for j in fused:
-            block = slice(first, first + len(sensors[j].R))
-            R[block, block] = sensors[j].R
-            first = block.stop
-        H = np.concatenate([sensors[j].H for j in fused])
-        total = total + weight[:, None, None] * update(prior, H, R, np.concatenate([z[j] for j in fused])[:, None]).x
+        x, L = prior.x, start
+        for j in (own, *senders[inside]):
+            # one measurement after the other, with the gain P HᵀR⁻¹ of the posterior: precise sensors lose nothing
+            H, R = sensors[j]
+            L = update_factor(L, H, R)
+            x = x + L @ (np.swapaxes(L, -1, -2) @ np.linalg.solve(R, H).T @ (z[j][:, None] - H @ x))
+        total = total + np.where(inside, heard, 1.0 - heard).prod(axis=1)[:, None, None] * x
     return total
 
 

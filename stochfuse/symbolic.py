@@ -219,7 +219,9 @@ class SimplifiedForm:
         """
         *before, (_, last) = self.chain
         named: Any = lambda expr: (before, expr)  # noqa: E731 - SymPy takes a function here, its annotation does not say so
-        return sympy.lambdify((MU, *self.symbols), last, modules="numpy", cse=named)
+        function = sympy.lambdify((MU, *self.symbols), last, modules="numpy", cse=named)
+        # where P does not depend on µ SymPy returns one number, whatever the shape of µ
+        return lambda mu, *values: function(mu, *values) + 0.0 * np.asarray(mu)
 
     def _mixture(self, prior: sympy.Expr) -> sympy.Expr:
         one, r = sympy.eye(1), sympy.Matrix([[self.r]])

@@ -6,10 +6,8 @@ import csv
 import io
 import json
 import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -100,7 +98,7 @@ def test_fcs_demo_is_readable_at_80_columns_and_complete():
     assert p.steady_values("rms:x,y") is not None
     for value in [*p.values("rms:x,y").ravel(), *p.steady_values("rms:x,y")]:
         assert f"{value:#.5g}" in done.stdout
-    assert done.stdout.count("network minimum") == len([line for line in lines if "k=" in line])
+    assert done.stdout.count("network minimum") == len([line for line in lines if "mean µ" in line])
     assert "masked network" in done.stderr
     assert "note: the steady state is proved to lie within a relative 1e-12" in done.stderr
 
@@ -345,21 +343,19 @@ def test_a_closed_pipe_is_quiet():
     assert done.stdout.startswith("method,")
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.1, 0.5, 2.0])
-def test_ctrl_c_is_quiet(delay):
-    """From the moment that the command line has begun, imports included."""
+@pytest.mark.parametrize("seconds", [0.01, 0.1, 0.3, 1.0])
+def test_ctrl_c_is_quiet(seconds):
+    """After so much processor time of the command line, imports included, whatever the load of the machine."""
     work = ["predict", "cv-2d", "--agents", "500", "--link", "0:1:0.0001", "--steps", "5000"]
-    code = f"import sys; sys.argv = ['stochfuse', *{work}]; import stochfuse.cli; print('ready', flush=True); stochfuse.cli.main()"
-    process = subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ENV
+    code = (
+        f"import signal, sys, stochfuse.cli; sys.argv = ['stochfuse', *{work}]\n"
+        "signal.signal(signal.SIGPROF, lambda *_: signal.raise_signal(signal.SIGINT))\n"
+        f"signal.setitimer(signal.ITIMER_PROF, {seconds})\n"
+        "stochfuse.cli.main()"
     )
-    assert process.stdout is not None
-    assert process.stdout.readline() == "ready\n"
-    time.sleep(delay)
-    process.send_signal(signal.SIGINT)
-    output, errors = process.communicate(timeout=60)
-    assert (process.returncode, output) == (130, "")
-    assert "Traceback" not in errors
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=ENV)
+    assert (done.returncode, done.stdout) == (130, "")
+    assert "Traceback" not in done.stderr
 
 
 def test_completion_knows_commands_and_presets():

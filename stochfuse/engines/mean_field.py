@@ -19,7 +19,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from stochfuse.arrivals import Arrivals
-from stochfuse.averaged import prior_map, triangle, update_measurement_space, update_scalar
+from stochfuse.averaged import prior_map, smallest_pivot, triangle, update_measurement_space, update_scalar
 from stochfuse.kalman import (
     Information,
     factor,
@@ -122,7 +122,11 @@ class MeasurementSpace:
         if d == 1:
             return Carried(update_scalar(prior, J, arrivals), carried.left)
         P, left = update_measurement_space(prior, d, sensor.H.shape[-2], arrivals)
-        return Carried(P, np.minimum(carried.left, left))
+        left = np.minimum(carried.left, left)
+        if step % 8 == 0 or step == len(self.case.arrivals):
+            # digits lost by degrees over many steps show in the end as a P that is nearly singular
+            left = np.minimum(left, smallest_pivot(P, d))
+        return Carried(P, left)
 
     def covariance(self, carried: Carried, out: np.ndarray | None = None) -> np.ndarray:
         return np.take(carried.value, triangle(self.case.model.dimension)[2], axis=0, out=out, mode="clip")
