@@ -14,6 +14,10 @@ from stochfuse.errors import Problem
 
 SYMMETRY = 1e-9
 """Largest |A − Aᵀ|, in units of the standard deviations, that is taken for rounding."""
+LARGEST = 1e100
+"""Largest size of a number: its square and the square's products stay within floating point."""
+MOST = 10_000_000
+"""Most agents and most steps."""
 INDEFINITE = -1e-9
 """Most negative eigenvalue, scaled to unit diagonal, that is taken for rounding of a singular matrix."""
 
@@ -51,11 +55,17 @@ class Checker:
             return None
         try:
             array = np.array(value, dtype=float)
+        except OverflowError:
+            self.note(path, expected, "a number beyond floating point")
+            return None
         except (ValueError, TypeError):
             self.note(path, expected, f"{shown(value)} (rows of different length?)")
             return None
         if not np.isfinite(array).all():
             self.note(path, expected, "a value that is not finite (NaN or infinity)")
+            return None
+        if array.size and np.abs(array).max() > LARGEST:
+            self.note(path, f"numbers of at most {LARGEST:g} in size", f"{array.flat[np.abs(array).argmax()]:g}")
             return None
         array.setflags(write=False)
         return array
@@ -141,7 +151,16 @@ class Checker:
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
             self.note(path, f"a whole number of at least {least}", shown(value))
             return None
+        if value > MOST:
+            self.note(path, f"at most {MOST}", shown(value))
+            return None
         return int(value)
+
+    def name(self, path: str, value: str, *, of_state: bool = False) -> None:
+        """Note a name that cannot be shown on one line, or, of a state, cannot be named in a metric."""
+        bad = [c for c in value if not c.isprintable() or (of_state and c in ",:")]
+        if bad or (of_state and not value.strip()):
+            self.note(path, f"printable text{', not empty, without comma and colon' if of_state else ''}", shown(value))
 
     def choice(self, path: str, value: Any, choices: Sequence[str]) -> str | None:
         """Read one of a few words."""
@@ -167,7 +186,8 @@ class Checker:
             depths = [np.ndim(entry) if not isinstance(entry, list | tuple) else _depth(entry) for entry in value]
             if set(depths) == {0, 2}:
                 value = [
-                    np.full((agents, agents), e) if depth == 0 else e for e, depth in zip(value, depths, strict=True)
+                    np.full((agents, agents), e).tolist() if depth == 0 else e
+                    for e, depth in zip(value, depths, strict=True)
                 ]
         array = self.array(path, value, expected)
         if array is None:

@@ -210,7 +210,7 @@ def update_factor(
 
     U comes from one-sided Jacobi rotations and V from Householder reflections that are applied to L one after the
     other, the largest component first.  A general SVD knows V to rounding only; a reflection keeps the *relative* size
-    of its small components, and with them states that are known a trillion times better than they were before the measurement.
+    of its small components, and with them states that become a trillion times better known than they were.
 
     Parameters
     ----------

@@ -60,6 +60,8 @@ def metric(name: str, model: Model) -> Metric:
         return Metric(name, f"determinant over {everything}", units, np.linalg.det)
     if kind in ("var", "std", "rms") and rest:
         chosen = [_index(name, state.strip(), model) for state in rest.split(",")]
+        if len(set(chosen)) < len(chosen):
+            raise UsageError(f"metric '{name}': a state is named twice")
         if kind != "rms" and len(chosen) > 1:
             raise UsageError(f"metric '{name}': expected one state, got {len(chosen)}; use rms: for several")
         units = {model.units[i] for i in chosen}

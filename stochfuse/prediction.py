@@ -90,10 +90,11 @@ class Prediction:
 
     def _reduce(self, P: np.ndarray, of: str | Metric, agent: int | str) -> np.ndarray:
         m = metric(of, self.scenario.model) if isinstance(of, str) else of
-        if agent in ("worst", "best"):
-            each = m.of(P)
-            return each.max(axis=-1) if agent == "worst" else each.min(axis=-1)
-        return m.of(_select(P, self.group_of, agent))
+        with np.errstate(over="ignore", invalid="ignore"):
+            if agent in ("worst", "best"):
+                each = m.of(P)
+                return each.max(axis=-1) if agent == "worst" else each.min(axis=-1)
+            return m.of(_select(P, self.group_of, agent))
 
 
 def _select(P: np.ndarray, group_of: np.ndarray, agent: int | str) -> np.ndarray:

@@ -24,6 +24,7 @@ import numpy as np
 
 from stochfuse.checks import Checker, shown
 from stochfuse.errors import Problem, ScenarioError, UsageError
+from stochfuse.metrics import metric as metric_of
 from stochfuse.model import Model, Sensor
 from stochfuse.network import ARCHITECTURES, LinkRows, Network, default_rows, stacked_rows, uniform_rows
 
@@ -152,7 +153,11 @@ def read_text(source: str | Path) -> tuple[str, str]:
     if is_preset(source):
         return str(source), (_PRESETS / f"{source}.toml").read_text(encoding="utf-8")
     if source == "-":
+        if sys.stdin is None:
+            raise ScenarioError("standard input", "closed")
         return "standard input", sys.stdin.read()
+    if str(source) == "":
+        raise ScenarioError("scenario", "expected a file or a preset's name, got nothing")
     path = Path(source)
     try:
         return str(path), path.read_text(encoding="utf-8")
@@ -168,7 +173,7 @@ def read_text(source: str | Path) -> tuple[str, str]:
 def parse(name: str, text: str) -> dict[str, Any]:
     """Parse TOML, or JSON if the text begins with a brace."""
     try:
-        if text.lstrip("\ufeff \t\r\n").startswith("{"):
+        if text.lstrip("\ufeff \t\r\n").startswith("{") or name.lower().endswith(".json"):
             import json
 
             mapping = json.loads(text.lstrip("\ufeff"))
@@ -182,6 +187,8 @@ def parse(name: str, text: str) -> dict[str, Any]:
         raise ScenarioError(
             name, f"not valid {'JSON' if 'json' in type(error).__module__ else 'TOML'}: {error}"
         ) from None
+    if not isinstance(mapping, dict):
+        raise ScenarioError(name, f"expected a table with [model], [initial] and [network], got {shown(mapping)}")
     if not mapping:
         raise ScenarioError(name, "empty; see `stochfuse scenario new`")
     return mapping
@@ -229,6 +236,11 @@ def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> S
     error = check.vector("initial.error", initial.get("error"), d)
     report = mapping.get("report")
     metric = report.get("metric") if isinstance(report, dict) else None
+    if isinstance(metric, str) and model is not None:
+        try:
+            metric_of(metric, model)
+        except UsageError as error:
+            check.note("report.metric", "a metric of this model", f"'{metric}' ({error})")
     problems = [*structure, *check.problems]
     if problems:
         raise ScenarioError(name, problems)
@@ -254,6 +266,8 @@ def _network(check: Checker, table: Mapping[str, Any]) -> Network | None:
     steps = check.integer("network.steps", table.get("steps"), 1)
     architecture = check.choice("network.architecture", table.get("architecture", "ad-hoc"), ARCHITECTURES)
     if agents is None or steps is None or architecture is None:
+        if isinstance(table.get("link"), int | float):
+            check.link("network.link", table["link"], 1, 1)
         return None
     link = _link(check, "network.link", table.get("link"), agents, steps, architecture)
     cases = []
@@ -262,10 +276,14 @@ def _network(check: Checker, table: Mapping[str, Any]) -> Network | None:
             continue
         path = f"network.case[{i}].link"
         own = link if case.get("link") is None else _link(check, path, case["link"], agents, steps, architecture)
+        name = str(case.get("name", i))
+        check.name(f"network.case[{i}].name", name)
+        if name in [other for other, _ in cases]:
+            check.note(f"network.case[{i}].name", "a name of its own", shown(name))
         if own is None and case.get("link") is None:
             check.note(path, "a link probability here or in network.link", "nothing")
         elif own is not None:
-            cases.append((str(case.get("name", i)), own))
+            cases.append((name, own))
     return Network(agents, steps, architecture, link, tuple(cases), _delay(check, table.get("delay")))
 
 
@@ -334,6 +352,8 @@ def _names(check: Checker, path: str, value: Any, d: int | None) -> tuple[str, .
         check.note(path, f"{d} names, one per state", f"{len(value)}")
     elif path.endswith("states") and len(set(value)) < d:
         check.note(path, "different names", shown(value))
+    for i, name in enumerate(value, start=1):
+        check.name(f"{path}[{i}]", str(name), of_state=path.endswith("states"))
     return tuple(map(str, value))
 
 

@@ -11,6 +11,7 @@ arithmetic, never from `simplify`:
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -35,6 +36,14 @@ MOST_FACTORS_SYMBOLS = 9
 """Factors of the denominator, n^(step−1), up to which P(step) is expanded with q, r and p0 all symbols."""
 MOST_FACTORS_NUMBERS = 250
 """The same where only µ and at most one other symbol is left."""
+
+
+MOST_DEGREE = 250
+"""Degree in µ up to which P(step) is expanded."""
+MOST_AGENTS_CLEARED = 12
+"""Agents up to which the fixed-point equation is cleared of its denominators."""
+MOST_AGENTS_OR_STEPS = 100
+"""Agents and steps up to which even the chain is written down."""
 
 
 class Ratio:
@@ -118,7 +127,9 @@ class SimplifiedForm:
     def expandable(self) -> bool:
         """Whether the closed form of the last step is of a size that can be read or stored."""
         few = len(self.symbols) <= 1
-        return self.agents ** (self.step - 1) <= (MOST_FACTORS_NUMBERS if few else MOST_FACTORS_SYMBOLS)
+        if self.agents ** (self.step - 1) > (MOST_FACTORS_NUMBERS if few else MOST_FACTORS_SYMBOLS):
+            return False
+        return self.step == 1 or (self.agents - 1) * self.agents ** (self.step - 1) <= MOST_DEGREE
 
     @cached_property
     def fractions(self) -> tuple[tuple[sympy.Poly, sympy.Poly], ...]:
@@ -270,8 +281,8 @@ def derive_simplified(
         If a number is out of range.
     """
     for name, value in (("agents", agents), ("step", step)):
-        if value < 1:
-            raise UsageError(f"{name}: expected at least 1, got {value}")
+        if not 1 <= value <= MOST_AGENTS_OR_STEPS:
+            raise UsageError(f"{name}: expected 1 to {MOST_AGENTS_OR_STEPS} for formulas, got {value}")
     numbers = [_number(n, v, s) for n, v, s in (("q", q, Q), ("r", r, R), ("p0", p0, P0))]
     if numbers[1] == 0:
         raise UsageError("r: expected a positive number, got 0")
@@ -284,6 +295,8 @@ def _number(name: str, value: Any, symbol: sympy.Symbol) -> sympy.Expr:
     if value is None:
         return symbol
     try:
+        if len(str(value)) > 60 or re.search(r"e[+-]?0*\d{4,}", str(value), re.IGNORECASE):
+            raise ValueError("more digits than a formula can use")
         number = sympy.Rational(str(value))
     except (TypeError, ValueError, ZeroDivisionError):
         raise UsageError(f"{name}: expected a number, got '{value}'") from None

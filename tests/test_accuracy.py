@@ -47,6 +47,16 @@ CASES = {
         np.diag([1e10, 1, 1e-8, 1e-16]),
     ),
 }
+for _T, _P, _R in ((10, 1e6, 1e-8), (10, 1e12, 1e-14), (1e4, 1e12, 1e-8)):
+    # two precise fixes a long time apart make the speed a trillion times better known
+    _F = np.array([[1.0, _T], [0.0, 1.0]])
+    CASES[f"T = {_T}, P0 = {_P}, R = {_R}"] = (_F, np.zeros((2, 2)), H[:1, :2], _R * np.eye(1), _P * np.eye(2))
+CASES["correlated P0, T = 2e4"] = (
+    np.array([[1, -2e4], [0, 1]]), np.zeros((2, 2)), H[:1, :2], 8e-9 * np.eye(1), np.array([[1.2e-7, 0.08], [0.08, 6e4]])
+)  # fmt: skip
+CASES["three sensors of one state, the middle form useless"] = (
+    np.eye(2), np.zeros((2, 2)), np.ones((3, 2)), np.diag([1, 1e-8, 1e-13]), 2e4 * np.eye(2)
+)  # fmt: skip
 LINKS = (0.0, 0.1, 0.5, 1.0)
 
 
@@ -81,6 +91,43 @@ def test_unlike_agents_to_nine_digits(case):
             P = own / 4 + with_one / 2 + with_two / 4
             exact = np.array([[float(P[i, j]) for j in range(4)] for i in range(4)])
             assert textbook.scaled_error(got.of_agent(3)[0, k], exact) < 1e-9
+
+
+def test_digits_lost_by_degrees_are_noticed():
+    """Every step leaves most of the variance, but a direction known to 1e12 at first ends at 1."""
+    steps = 8
+    H = np.array([[[1.0, -1.0]]] * 4 + [[[1.0, 1.0]]] * 4)
+    R = np.array([[[r]] for r in (1, 1e8, 1e4, 1, 1e8, 1e4, 1, 1)])
+    source = mapping(np.eye(2), np.zeros((2, 2)), H, R, 1e12 * np.eye(2), agents=1, steps=steps)
+    got = sf.predict(sf.Scenario.from_mapping(source), [0.0])
+    assert got.forms == ("square-root",)
+    import mpmath as mp
+
+    with mp.workdps(60):
+        P = textbook.mp_matrix(1e12 * np.eye(2))
+        for k in range(1, steps):
+            P = textbook.mp_update(P, textbook.mp_matrix(H[k]), textbook.mp_matrix(R[k]))
+            exact = np.array([[float(P[i, j]) for j in range(2)] for i in range(2)])
+            assert textbook.scaled_error(got.covariance[0, k], exact) < 1e-9
+
+
+@pytest.mark.parametrize("precise", [1e-14, 1e-20])
+def test_precise_and_coarse_sensors_mixed(precise):
+    P0 = np.eye(4)
+    P0[0, 2] = P0[2, 0] = 1.0
+    H, Q = np.eye(4)[[0, 2]], np.diag([1.0, 1, 1, 0])
+    source = mapping(np.eye(4), Q, H, np.eye(2), P0, agents=2, steps=2)
+    source["initial"]["correlation"] = "shared"
+    source["agent"] = [{"R": [[1, 0], [0, precise]]}, {}]
+    got = sf.predict(sf.Scenario.from_mapping(source), [1.0]).of_agent(1)[0, 1]
+    import mpmath as mp
+
+    with mp.workdps(60):
+        P = textbook.mp_matrix(P0) + textbook.mp_matrix(Q)
+        for noise in (np.diag([1, precise]), np.eye(2)):
+            P = textbook.mp_update(P, textbook.mp_matrix(H), textbook.mp_matrix(noise))
+        exact = np.array([[float(P[i, j]) for j in range(4)] for i in range(4)])
+    assert textbook.scaled_error(got, exact) < 1e-9
 
 
 def test_the_form_is_chosen_by_conditioning():

@@ -280,6 +280,12 @@ BAD = [
     (["predict", "--output", "/nowhere/x.csv"], "error: cannot write /nowhere/x.csv: there is no directory /nowhere"),
     (["predict", "--output", "/tmp"], "error: cannot write /tmp: it is a directory"),
     (["predict", "--plot", "x.bmp"], "error: x.bmp: expected a name that ends in .png, .svg, .pdf"),
+    (["predict", "--output", "x.png", "--plot", "x.png"], "error: --output and --plot: expected different files"),
+    (["predict", "--p0", "0", "--q", "0", "--normalise"], "is 0 at link probability 0 and cannot be normalised to it"),
+    (["predict", ""], "error: scenario: expected a file or a preset's name, got nothing"),
+    (["scenario", "new", "--output", "x.json"], "error: x.json: a new scenario is TOML"),
+    (["derive", "--latex", "--format", "json"], "error: --latex and --format: expected one of them, got both"),
+    (["derive", "--agents", "100000"], "error: agents: expected 1 to 100 for formulas, got 100000"),
     (["derive", "--q", "abc"], "error: q: expected a number, got 'abc'"),
     (["derive", "general"], "Invalid value for"),
     (["scenario", "check", "nothing.toml"], "no such file"),
@@ -317,7 +323,7 @@ def test_a_covariance_beyond_floating_point_is_a_failure_not_a_nan(tmp_path):
     file = tmp_path / "drift.toml"
     file.write_text("[model]\nF = 2\nH = 0\nQ = 1\nR = 1\n[initial]\nP = 1\n[network]\nagents = 2\nsteps = 600\n")
     done = run("predict", str(file), "--format", "json", code=1)
-    assert "error: the prediction is not finite: the covariance grows beyond floating point" in done.stderr
+    assert "error: the prediction is not finite: the values grow beyond floating point" in done.stderr
     assert done.stdout == ""
 
 
@@ -334,6 +340,20 @@ def test_an_existing_file_survives_a_failure(tmp_path):
     assert target.read_text() == "precious"
     run("predict", "--output", str(target))
     assert target.read_text().startswith("method,")
+
+
+@pytest.mark.parametrize("command", ["predict", "--help", "--version", "scenario schema"])
+def test_a_full_or_closed_standard_output_is_a_failure_in_one_line(command):
+    for redirect in (">/dev/full", ">&-"):
+        done = subprocess.run(
+            ["bash", "-c", f"{sys.executable} -m stochfuse {command} {redirect}"],
+            capture_output=True,
+            text=True,
+            env=ENV,
+        )
+        assert done.returncode == 1
+        assert done.stderr.count("\n") == 1
+        assert "standard output" in done.stderr
 
 
 def test_a_closed_pipe_is_quiet():

@@ -72,6 +72,19 @@ def test_an_unobserved_mode_has_no_steady_state(F, H, mode):
         sf.steady_state(s)
 
 
+def test_the_units_of_the_states_do_not_matter():
+    plain = mapping(np.diag([1.1, 0.5]), np.eye(2), [[1, 1]], 1.0, np.eye(2))
+    scaled = mapping(np.diag([1.1, 0.5]), np.diag([1e22, 1]), [[1e-11, 1]], 1.0, np.diag([1e22, 1]))
+    a, b = (sf.steady_state(sf.Scenario.from_mapping(m), [0.5]).P[0, 0] for m in (plain, scaled))
+    np.testing.assert_allclose(b / np.outer([1e11, 1], [1e11, 1]), a, rtol=1e-9)
+
+
+def test_without_process_noise_the_steady_state_is_zero():
+    steady = sf.steady_state(sf.Scenario.from_mapping(mapping(1.0, 0.0, 1.0, 1.0, 1.0)), [0.0, 0.7])
+    assert steady.P.ravel().tolist() == [0.0, 0.0]
+    assert steady.bound.ravel().tolist() == [0.0, 0.0]
+
+
 def test_what_varies_with_the_step_has_none():
     for change in ({"link": [0.1, 0.2, 0.3, 0.4]}, {}):
         source = mapping(1.0, 1.0, 1.0, 1.0, 1.0, **change)

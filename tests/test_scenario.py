@@ -192,6 +192,21 @@ BAD = [
     ),
     ("agent", [{}, {"Q": 1}, {}], "agent[2].Q: expected a known key, got an unknown one, 'Q'"),
     ("report", {"metric": 3}, "report.metric: expected text, got 3"),
+    (
+        "report",
+        {"metric": "std:z"},
+        "report.metric: expected a metric of this model, got 'std:z' (metric 'std:z': no state 'z'",
+    ),
+    ("network.agents", 10**30, "network.agents: expected at most 10000000, got 1000000"),
+    ("model.R", 1e200, "model.R: expected numbers of at most 1e+100 in size, got 1e+200"),
+    ("model.R", 10**400, "model.R: expected"),
+    (
+        "model.states",
+        ["x", "a:b"],
+        "model.states[2]: expected printable text, not empty, without comma and colon, got 'a:b'",
+    ),
+    ("model.units", ["m", "a\nb"], "model.units[2]: expected printable text, got 'a\\nb'"),
+    ("network.case", [{"name": "a"}, {"name": "a"}], "network.case[2].name: expected a name of its own, got 'a'"),
 ]
 
 
@@ -229,6 +244,7 @@ def test_not_even_a_table(value):
         ("", "empty; see `stochfuse scenario new`"),
         ("[model\nF = 1", r"not valid TOML: .*\(at line 1, column 7\)"),
         ("[model]\nF = 1\nF = 2", "not valid TOML: Cannot overwrite a value"),
+        ("[]", "not valid TOML"),
         ('{"model": 1,}', r"not valid JSON: .* line 1 column"),
         ("{" + '"a":{' * 100_000, "not valid JSON|nested too deeply"),
     ],

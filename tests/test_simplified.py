@@ -234,6 +234,12 @@ def test_the_three_forms_of_an_outcome_agree():
         np.testing.assert_allclose(outcome_by_information(Estimate(None, P), H, R, m).P, printed.P, rtol=1e-10)
 
 
+def test_one_agent_alone_with_a_matrix_of_links():
+    p = sf.predict(sf.Scenario.from_mapping(mapping(1.0, 1.0, 1.0, 1.0, 1.0, agents=1, steps=2, link=[[0.5]])))
+    assert p.link.tolist() == [0.0]
+    assert p.values()[0].tolist() == [1.0, pytest.approx(2 / 3)]
+
+
 def test_delay_is_refused_with_the_reason():
     source = mapping(1.0, 1.0, 1.0, 1.0, 1.0, delay=[0.5, 0.5])
     with pytest.raises(

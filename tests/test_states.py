@@ -135,6 +135,28 @@ def test_a_record_that_all_share_is_the_same_as_equal_own_records():
     np.testing.assert_allclose(shared.x, own.x, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.parametrize("R", [1e-8, 1e-14])
+def test_own_records_of_precise_sensors_keep_their_digits(R):
+    """Measurements with R, R and R make the same estimate as their mean with R/3, in 60 digits."""
+    F, H, Q, P0 = np.array([[1.0, 1], [0, 1]]), np.array([[1.0, 0]]), np.diag([0.1, 0.5]), np.diag([100.0, 9])
+    z = np.random.default_rng(11).normal(size=(3, 3, 1)) * 100
+    source = mapping(F, Q, H, R, P0, agents=3, steps=3)
+    got = sf.predict_states(sf.Scenario.from_mapping(source), z, [1.0]).x[0]
+    import mpmath as mp
+
+    with mp.workdps(60):
+        Fm, Hm, Qm, P = map(textbook.mp_matrix, (F, H, Q, P0 / 3))
+        x = mp.matrix([0, 0])
+        for k in (1, 2):
+            x, P = Fm * x, Fm * P * Fm.T + Qm
+            mean = mp.fsum(mp.mpf(float(v)) for v in z[k, :, 0]) / 3
+            gain = P * Hm.T / ((Hm * P * Hm.T)[0] + mp.mpf(R) / 3)
+            x = x + gain * (mean - (Hm * x)[0])
+            P = textbook.mp_update(P, Hm, mp.matrix([[mp.mpf(R) / 3]]))
+            for agent in range(3):
+                np.testing.assert_allclose(got[k, agent], [float(x[0]), float(x[1])], rtol=1e-9)
+
+
 def test_a_known_input_moves_the_state():
     source = mapping([[1, 1], [0, 1]], np.eye(2), [[1, 0]], 1e9, np.eye(2), agents=1, steps=3)
     source["model"] |= {"B": [[0.5], [1.0]], "u": [2.0]}

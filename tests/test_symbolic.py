@@ -175,6 +175,11 @@ def test_lambdified_chain_equals_the_numeric_form(agents, step, q, r, p0, shared
     np.testing.assert_allclose(formula(link, q, r, p0) * np.ones(4), numeric, rtol=1e-12)
 
 
+@pytest.mark.parametrize("form", [derive_simplified(1, 2), derive_simplified(3, 1, correlation="shared")])
+def test_lambdified_functions_keep_the_shape_of_mu(form):
+    assert form.lambdify()(np.array([0.0, 0.5, 1.0]), 1.0, 1.0, 1.0).shape == (3,)
+
+
 def test_the_chain_goes_on_where_the_expanded_form_stops():
     form = derive_simplified(3, 8)
     assert not form.expandable
@@ -188,9 +193,11 @@ def test_the_chain_goes_on_where_the_expanded_form_stops():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"agents": 0}, "agents: expected at least 1, got 0"),
-        ({"step": 0}, "step: expected at least 1, got 0"),
+        ({"agents": 0}, "agents: expected 1 to 100 for formulas, got 0"),
+        ({"step": 0}, "step: expected 1 to 100 for formulas, got 0"),
         ({"q": "abc"}, "q: expected a number, got 'abc'"),
+        ({"step": 101}, "step: expected 1 to 100 for formulas, got 101"),
+        ({"q": "1e99999"}, "q: expected a number, got '1e99999'"),
         ({"q": -1}, "q: expected a number of at least 0, got -1"),
         ({"q": "nan"}, "q: expected a number"),
         ({"p0": "1/0"}, "p0: expected a number"),

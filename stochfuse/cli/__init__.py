@@ -12,9 +12,14 @@ def main() -> None:
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, TextIOWrapper):
                 stream.reconfigure(errors="replace")
+        if sys.stdout is None:
+            sys.exit("error: standard output is closed")
         from stochfuse.cli.app import app
 
         app(prog_name="stochfuse")
+    except OSError as error:  # --help and --version write before a command runs
+        sys.stdout = None
+        sys.exit(f"error: cannot write to standard output: {error.strerror or error}")
     except KeyboardInterrupt:
         sys.stderr.write("interrupted\n")
         sys.exit(130)

@@ -34,11 +34,18 @@ class Group(TyperGroup):
         except MemoryError:
             _fail("error: not enough memory; ask for fewer links, steps or agents at a time", EXIT_FAILURE)
         except BrokenPipeError:
-            # the reader has seen enough (`| head -1`); keep the interpreter from complaining when it flushes
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            _silence()  # the reader has seen enough (`| head -1`)
             raise typer.Exit(0) from None
+        except OSError as error:
+            _silence()
+            _fail(f"error: cannot write to standard output: {error.strerror or error}", EXIT_FAILURE)
         except KeyboardInterrupt:
             _fail("interrupted", EXIT_INTERRUPTED)
+
+
+def _silence() -> None:
+    """Keep the interpreter from complaining when it flushes what cannot be written any more."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _fail(message: str, code: int) -> None:

@@ -44,9 +44,9 @@ def derive(
     correlation: Annotated[Correlation, typer.Option(help="Initial estimates.")] = Correlation.independent,
     latex: Annotated[bool, typer.Option("--latex", help="The same as --format latex.")] = False,
     format: Annotated[
-        FormulaFormat,
-        typer.Option("--format", "-f", help="text: two-dimensional in a terminal, one line each when piped."),
-    ] = FormulaFormat.text,
+        FormulaFormat | None,
+        typer.Option("--format", "-f", help="text (default): two-dimensional in a terminal, one line each when piped."),
+    ] = None,
     output: OutputOption = None,
 ) -> None:
     """Print the equations: chain, rational function of µ, derivative, series at µ = 0 and 1, fixed point.
@@ -56,8 +56,11 @@ def derive(
     """
     import sys
 
+    from stochfuse.errors import UsageError
     from stochfuse.report.export import check_writable, terminal_width, to_json, write_text
 
+    if latex and format not in (None, FormulaFormat.latex):
+        raise UsageError("--latex and --format: expected one of them, got both")
     check_writable(output)
     from stochfuse.report import derivation
     from stochfuse.symbolic import derive_simplified

@@ -45,7 +45,10 @@ def predict(
         ),
     ] = None,
     q: Annotated[float | None, typer.Option(help="Process noise variance Q (times the identity).")] = None,
-    r: Annotated[float | None, typer.Option(help="Measurement noise variance R (times the identity).")] = None,
+    r: Annotated[
+        float | None,
+        typer.Option(help="Measurement noise variance R (times the identity), of agents without their own."),
+    ] = None,
     p0: Annotated[
         float | None, typer.Option(help="Variance of the initial estimates P(k0) (times the identity).")
     ] = None,
@@ -75,6 +78,7 @@ def predict(
 
     Without a scenario: the thesis' transient one. Options override the scenario.
     """
+    from stochfuse.errors import UsageError
     from stochfuse.methods import predict as run
     from stochfuse.metrics import metric as metric_of
     from stochfuse.report.export import PLOT_SUFFIXES, check_writable
@@ -83,6 +87,8 @@ def predict(
 
     check_writable(output)
     check_writable(plot, PLOT_SUFFIXES)
+    if plot is not None and output is not None and plot.resolve() == output.resolve():
+        raise UsageError(f"--output and --plot: expected different files, got {output} for both")
     links = None if link is None else parse_link(link)
     given = load_scenario(
         scenario,

@@ -93,6 +93,8 @@ def new(
     if not is_preset(preset):
         raise UsageError(f"no preset '{preset}'; the presets are {', '.join(preset_names())}")
     check_writable(output)
+    if output is not None and output.suffix.lower() == ".json":
+        raise UsageError(f"{output}: a new scenario is TOML, with comments; give a name that ends in .toml")
     if output is not None and output.exists():
         raise UsageError(f"{output} exists already")
     write_text(NEW_HEADER + read_text(preset)[1], output)

@@ -45,10 +45,18 @@ PRECISE = 1e4
 
 
 class Carried(NamedTuple):
-    """A form's state between steps, and the smallest share of variance any update so far has left."""
+    """A form's state between steps.
+
+    Parameters
+    ----------
+    value : the form's own representation of P.
+    left : (items,) smallest share of variance that is left of what was there before; its inverse times 1e-16 is lost.
+    peak : (d, items) largest variance of each state so far, where the form keeps account of it.
+    """
 
     value: np.ndarray
     left: np.ndarray
+    peak: np.ndarray | None = None
 
 
 class Form(Protocol):
@@ -111,7 +119,8 @@ class MeasurementSpace:
 
     def start(self) -> Carried:
         rows, columns, _ = triangle(self.case.model.dimension)
-        return Carried(self.case.P0[rows, columns][:, None] * self.case.first_share(), np.ones(self.case.items))
+        P = self.case.P0[rows, columns][:, None] * self.case.first_share()
+        return Carried(P, np.ones(self.case.items))
 
     def advance(self, carried: Carried, step: int) -> Carried:
         model, sensor = self.case.model, self.case.sensor
@@ -123,10 +132,14 @@ class MeasurementSpace:
             return Carried(update_scalar(prior, J, arrivals), carried.left)
         P, left = update_measurement_space(prior, d, sensor.H.shape[-2], arrivals)
         left = np.minimum(carried.left, left)
+        diagonal = triangle(d)[2].diagonal()
+        before = prior[diagonal]
+        peak = before if carried.peak is None else np.maximum(carried.peak, before)
         if step % 8 == 0 or step == len(self.case.arrivals):
-            # digits lost by degrees over many steps show in the end as a P that is nearly singular
-            left = np.minimum(left, smallest_pivot(P, d))
-        return Carried(P, left)
+            # digits are lost by degrees, too: to a variance far below its peak, or in a P that is nearly singular
+            fallen = (P[diagonal] / np.where(peak > 0, peak, np.inf)).min(axis=0, where=peak > 0, initial=1.0)
+            left = np.minimum(left, np.minimum(fallen, smallest_pivot(P, d)))
+        return Carried(P, left, peak)
 
     def covariance(self, carried: Carried, out: np.ndarray | None = None) -> np.ndarray:
         return np.take(carried.value, triangle(self.case.model.dimension)[2], axis=0, out=out, mode="clip")

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import sympy
 
 from stochfuse import __version__
-from stochfuse.symbolic import FIXED, MU, SimplifiedForm
+from stochfuse.symbolic import FIXED, MOST_AGENTS_CLEARED, MU, SimplifiedForm
 
 SCHEMA = "stochfuse.derivation/1"
 
@@ -54,11 +54,10 @@ def formulas(form: SimplifiedForm) -> list[Formula]:
             Formula("series_at_1", f"P_{k} near mu = 1, up to (1 - mu)^2", P_k, form.series(1)),
         ]
     steady = form.fixed_point()
-    polynomial = form.fixed_point_polynomial().as_expr()
-    lines += [
-        Formula("fixed_point", "steady state P: fixed-point equation", FIXED, steady.rhs),
-        Formula("fixed_point_polynomial", "the same, cleared of denominators", sympy.Integer(0), polynomial),
-    ]
+    lines.append(Formula("fixed_point", "steady state P: fixed-point equation", FIXED, steady.rhs))
+    if form.agents <= MOST_AGENTS_CLEARED:
+        cleared = form.fixed_point_polynomial().as_expr()
+        lines.append(Formula("fixed_point_polynomial", "the same, cleared of denominators", sympy.Integer(0), cleared))
     return lines
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from stochfuse import __version__
-from stochfuse.errors import StochfuseError
+from stochfuse.errors import StochfuseError, UsageError
 from stochfuse.metrics import Metric
 from stochfuse.prediction import Prediction
 from stochfuse.report.table import Table, number, to_csv
@@ -60,7 +60,7 @@ class View:
         if by is None:
             return values
         if (by == 0).any():
-            raise StochfuseError(f"{self.metric.label} is 0 at link probability 0 and cannot be normalised to it")
+            raise UsageError(f"{self.metric.label} is 0 at link probability 0 and cannot be normalised to it")
         return values / by
 
     @property
@@ -99,9 +99,7 @@ class View:
 
 def _finite(values: np.ndarray) -> np.ndarray:
     if not np.isfinite(values).all():
-        raise StochfuseError(
-            "the prediction is not finite: the covariance grows beyond floating point; take fewer steps"
-        )
+        raise StochfuseError("the prediction is not finite: the values grow beyond floating point")
     return values
 
 
