@@ -44,6 +44,9 @@ PRECISE = 1e4
 """Information gained in one step, relative to the prior's, above which unlike agents' updates go through an SVD."""
 
 
+_TINY = 1e-300
+
+
 class Carried(NamedTuple):
     """A form's state between steps.
 
@@ -135,10 +138,12 @@ class MeasurementSpace:
         diagonal = triangle(d)[2].diagonal()
         before = prior[diagonal]
         peak = before if carried.peak is None else np.maximum(carried.peak, before)
-        if step % 8 == 0 or step == len(self.case.arrivals):
-            # digits are lost by degrees, too: to a variance far below its peak, or in a P that is nearly singular
-            fallen = (P[diagonal] / np.where(peak > 0, peak, np.inf)).min(axis=0, where=peak > 0, initial=1.0)
-            left = np.minimum(left, np.minimum(fallen, smallest_pivot(P, d)))
+        # digits are lost by degrees, too: to a variance far below its peak, or over many steps in a nearly singular P
+        last = step == len(self.case.arrivals)
+        if last or step % 8 == 0:
+            left = np.minimum(left, ((P[diagonal] + _TINY) / (peak + _TINY)).min(axis=0))
+        if step >= 8 and (last or step % 8 == 0):
+            left = np.minimum(left, smallest_pivot(P, d))
         return Carried(P, left, peak)
 
     def covariance(self, carried: Carried, out: np.ndarray | None = None) -> np.ndarray:
