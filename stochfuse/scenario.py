@@ -239,8 +239,8 @@ def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> S
     if isinstance(metric, str) and model is not None:
         try:
             metric_of(metric, model)
-        except UsageError as error:
-            check.note("report.metric", "a metric of this model", f"'{metric}' ({error})")
+        except UsageError as reason:
+            check.note("report.metric", "a metric of this model", f"'{metric}' ({reason})")
     problems = [*structure, *check.problems]
     if problems:
         raise ScenarioError(name, problems)
