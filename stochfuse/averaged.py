@@ -73,7 +73,7 @@ def update_measurement_space(stacked: np.ndarray, d: int, p: int, arrivals: Arri
 
     Parameters
     ----------
-    stacked : (rows, items) the prior as `prior_map` gives it.
+    stacked : (rows, items) the prior as `prior_map` gives it; its first rows are overwritten with P.
     d, p : number of states and of measurements.
     arrivals : distribution of the number of messages, per item.
 
@@ -87,7 +87,7 @@ def update_measurement_space(stacked: np.ndarray, d: int, p: int, arrivals: Arri
     prior, AP, S = stacked[:n], stacked[n : n + p * d].reshape(p, d, -1), stacked[n + p * d :]
     s, W = _diagonalise(S, AP, p)
     g = arrivals.gained(s)
-    P = prior.copy()
+    P = prior  # overwritten: the caller made it for this step
     product, first = np.empty((d, P.shape[1])), 0
     for i in range(d):
         # row i of the upper triangle: entries (i, i) … (i, d−1) lie side by side

@@ -54,7 +54,7 @@ class Carried(NamedTuple):
     ----------
     value : the form's own representation of P.
     left : (items,) smallest share of variance that is left of what was there before; its inverse times 1e-16 is lost.
-    peak : (d, items) largest variance of each state so far, where the form keeps account of it.
+    peak : (d, items) largest prior variance of each state so far, looked at in the first step and every eighth.
     """
 
     value: np.ndarray
@@ -133,11 +133,12 @@ class MeasurementSpace:
         d, arrivals = model.dimension, self.case.arrivals[step - 1]
         if d == 1:
             return Carried(update_scalar(prior, J, arrivals), carried.left)
+        diagonal = triangle(d)[2].diagonal()
+        peak = carried.peak
+        if peak is None or step % 8 == 0:
+            peak = prior[diagonal] if peak is None else np.maximum(peak, prior[diagonal])
         P, left = update_measurement_space(prior, d, sensor.H.shape[-2], arrivals)
         left = np.minimum(carried.left, left)
-        diagonal = triangle(d)[2].diagonal()
-        before = prior[diagonal]
-        peak = before if carried.peak is None else np.maximum(carried.peak, before)
         # digits are lost by degrees, too: to a variance far below its peak, or over many steps in a nearly singular P
         last = step == len(self.case.arrivals)
         if last or step % 8 == 0:
