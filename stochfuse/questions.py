@@ -78,11 +78,8 @@ def steady_state(scenario: Scenario, link: Sequence[float] | LinkRows | None = N
     if scenario.model.varies or any(s.varies for s in sensors) or rows.varies:
         raise UsageError("a steady state needs a model, sensors and links that do not vary with the step")
     brief = replace(scenario, network=replace(scenario.network, steps=2))
-    parts, group_of, first = [], np.zeros(scenario.network.agents, dtype=int), 0
-    for group in simplified.groups(brief, rows):
-        for column, agents in enumerate(group.agents, start=first):
-            group_of[list(agents)] = column
-        first += group.columns
+    parts, groups = [], simplified.groups(brief, rows)
+    for group in groups:
         if isinstance(group.case, Case):
             _require_detectable(scenario.model, group.case.sensor, scenario.P0)
         P = _solve(group.case)
@@ -90,6 +87,7 @@ def steady_state(scenario: Scenario, link: Sequence[float] | LinkRows | None = N
         shape = (len(rows.link), group.columns)
         parts.append((P.reshape(*shape, *P.shape[1:]), residual.reshape(shape), bound.reshape(shape)))
     P, residual, bound = (np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
+    group_of = simplified.index_of_groups(groups, scenario.network.agents)
     return SteadyState(rows.means(scenario.network), P, group_of, residual, bound)
 
 

@@ -120,9 +120,8 @@ def covariances(scenario: Scenario, rows: LinkRows) -> Covariances:
         If messages are delayed, or unlike agents make too many outcomes.
     """
     steps, links = scenario.network.steps, len(rows.link)
-    group_of = np.zeros(scenario.network.agents, dtype=int)
-    parts, forms, first = [], set(), 0
-    for group in groups(scenario, rows):
+    parts, forms, all_groups = [], set(), groups(scenario, rows)
+    for group in all_groups:
         if isinstance(group.case, Case):
             P, cancelled = run_like(group.case, steps)
             forms |= {"square-root"} if cancelled.any() else set()
@@ -133,11 +132,16 @@ def covariances(scenario: Scenario, rows: LinkRows) -> Covariances:
             forms.add("outcomes")
         d = P.shape[1]
         parts.append(P.reshape(steps, d, d, links, group.columns).transpose(3, 0, 4, 1, 2))
-        for column, agents in enumerate(group.agents, start=first):
-            group_of[list(agents)] = column
-        first += group.columns
     P = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=2)
-    return Covariances(P, group_of, tuple(sorted(forms)))
+    return Covariances(P, index_of_groups(all_groups, scenario.network.agents), tuple(sorted(forms)))
+
+
+def index_of_groups(all_groups: Sequence[Group], agents: int) -> np.ndarray:
+    """Index of every agent's column among the columns of all groups, shape (agents,)."""
+    index = np.zeros(agents, dtype=int)
+    for column, members in enumerate(members for group in all_groups for members in group.agents):
+        index[list(members)] = column
+    return index
 
 
 def departures(scenario: Scenario, rows: LinkRows) -> list[str]:

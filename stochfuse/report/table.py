@@ -11,8 +11,6 @@ from rich import box
 from rich.console import Console
 from rich.table import Table as RichTable
 
-FORMATS = ("table", "csv", "json", "markdown", "latex")
-
 
 @dataclass(frozen=True)
 class Table:
