@@ -1,0 +1,414 @@
+"""Enumeration: every outcome of "which messages arrive", its probability (45)/(46), and what is claimed then.
+
+The structure comes first and knows no numbers: states of the estimator are carried from exchange to exchange with the weight
+of all outcomes that lead to them, and states that will behave alike are one.  The last two exchanges are not
+carried out state by state.  After the exchange at step k − 1 agent i knows what the agents that it heard, S_i, know together, and so
+what agents i ∈ A have in common after it is ∩ ∪_{j∈S_i} (pedigree of j): one of the few elements of a
+distributive lattice on n generators (18 for n = 3) instead of one for each of the 2^(n(n−1)) outcomes.  Then
+
+    Y_A(k) = Σ_{i∈A} local_i(∪S_i) + Σ_{T⊆A, |T|≥2} (−1)^(|T|+1) · common(∩_{i∈T} ∪S_i)
+
+is summed in floating point, for all states and outcomes at once.  With delays, or more agents than fit a machine word,
+the last exchange is carried out instead.
+
+The numbers come second (`expectations`): one structure serves every Q, R and P(k0) with the same agents and links.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from stochfuse.errors import NoAnswerError, UsageError
+from stochfuse.estimators import Estimator
+from stochfuse.events import Event, Outcome, Rows, Weights, concerning, fates, outcomes
+from stochfuse.information import Information
+from stochfuse.kalman import Estimate, from_information
+
+MOST_GENERATORS = 6
+"""Agents up to which truth tables of the lattice fit 64 bits."""
+MOST_CELLS = 1 << 21
+"""Outcomes of one exchange up to which they are listed."""
+CHUNK = 1 << 21
+"""Numbers per matrix entry that are worked on at a time."""
+
+
+class View(NamedTuple):
+    """Outcomes of the last exchanges as a set of agents A sees them: Y = Σ sign · Y[ids[:, index]].
+
+    Parameters
+    ----------
+    ids : (states, table) values of the ledger; −1 stands for nothing.
+    terms : (sign, index into the table per cell).
+    starts : first cell of every group of cells with one factor.
+    factors : weight of each group's cells, shape (groups, width).
+    shares : weight of "the agent fuses just this" for each group of agents, shape (groups of agents, width).
+    """
+
+    ids: np.ndarray
+    terms: tuple[tuple[int, np.ndarray], ...]
+    starts: np.ndarray
+    factors: np.ndarray
+    shares: list[Any]
+
+
+class Ending(NamedTuple):
+    """Everything that can be claimed at one step: states with their weights, and views of what follows."""
+
+    weights: np.ndarray
+    views: list[View]
+    events: int
+
+
+class Progress:
+    """What an enumeration tells while it works; this one says nothing."""
+
+    def expect(self, outcomes: float, graphs: float) -> None:
+        """Called once before long work starts."""
+
+    def advance(self, step: int, done: int, total: int) -> None:
+        """Called now and then within a step."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is to be enumerated.
+
+    Parameters
+    ----------
+    agents, steps : numbers of agents and steps.
+    delay : probabilities of 0, 1, 2 … steps of delay.
+    events : events of a step.
+    weights : bookkeeping of probabilities.
+    groups : agents that are alike.
+    most : states that may be carried at a time.
+    prune : whether the least likely states are left out where there are more, instead of giving up.
+    plain : carry every outcome to the end, merge nothing: for tests and benchmarks.
+    """
+
+    agents: int
+    steps: int
+    delay: tuple[float, ...]
+    events: Callable[[int], list[Event]]
+    weights: Weights
+    groups: tuple[tuple[int, ...], ...]
+    most: int = 100_000
+    prune: bool = False
+    plain: bool = False
+
+
+class Structure(NamedTuple):
+    """All outcomes, before any number is put in.
+
+    Parameters
+    ----------
+    endings : one per step.
+    states : number of states carried before each step's exchange.
+    outcomes : number of outcomes up to each step.
+    left_out : (rows,) probability of what was left out, or None.
+    """
+
+    endings: list[Ending]
+    states: list[int]
+    outcomes: list[int]
+    left_out: np.ndarray | None
+
+
+class TooManyError(UsageError):
+    """More outcomes than can be listed."""
+
+
+def enumerate_outcomes(estimator: Estimator, request: Request, progress: Progress | None = None) -> Structure:
+    """List what can be claimed at every step.
+
+    Raises
+    ------
+    TooManyError
+        If more states than `request.most` have to be carried.
+    """
+    progress = progress or Progress()
+    weights, n, steps = request.weights, request.agents, request.steps
+    drawn = [request.events(step) for step in range(1, steps + 1)]
+    events_up_to = np.cumsum([len(d) for d in drawn]).tolist()
+    number = [1]
+    for step, d in enumerate(drawn, start=1):
+        number.append(number[-1] * len(fates(request.delay, steps - step)) ** len(d))
+    two_steps = request.delay == (1.0,) and n <= MOST_GENERATORS and not request.plain
+    layer: dict[Any, Any] = {estimator.start(): weights.one()}
+    sizes, left_out = [1], np.zeros(weights.rows) if isinstance(weights, Rows) and request.prune else None
+    endings = [_ending(estimator, layer, drawn[0], 0, events_up_to[0], request)]
+    announced = False
+    for step in range(2, steps + 1):
+        degree = events_up_to[step - 2] if not two_steps else events_up_to[step - 3] if step > 2 else 0
+        if two_steps:
+            endings.append(_two_step_ending(estimator, layer, drawn[step - 2], drawn[step - 1], degree, events_up_to[step - 1], request))
+        if step < steps or not two_steps:
+            left = steps - step + 1
+            expected = _expected(sizes, len(layer) * number[step - 1] // number[step - 2])
+            if not announced and (expected > 1000 or step == steps):
+                progress.expect(float(number[steps]), _extrapolated(sizes, expected, steps - step - two_steps))
+                announced = True
+            _check_size(len(layer), expected, drawn[step - 2], len(fates(request.delay, left)), number[steps], step, request)
+            layer = _next_layer(estimator, layer, outcomes(drawn[step - 2], n, request.delay, left, weights), step - 1, request, progress)
+            if left_out is not None and len(layer) > request.most:
+                layer, lost = _likeliest(layer, request.most)
+                left_out += lost
+            sizes.append(len(layer))
+        if not two_steps:
+            endings.append(_ending(estimator, layer, drawn[step - 1], degree, events_up_to[step - 1], request))
+    return Structure(endings, sizes, number[1:], left_out)
+
+
+def _next_layer(
+    estimator: Estimator, layer: dict[Any, Any], possible: list[Outcome], step: int, request: Request, progress: Progress
+) -> dict[Any, Any]:
+    times, found = request.weights.times, {}
+    total = len(layer)
+    for done, (state, weight) in enumerate(layer.items()):
+        exchange = estimator.exchange(state)
+        for outcome in possible:
+            after = exchange.after(outcome.heard, outcome.late, merge=not request.plain)
+            new = times(weight, outcome.factor)
+            known = found.get(after)
+            found[after] = new if known is None else known + new
+        progress.advance(step, done + 1, total)
+    return found
+
+
+def _likeliest(layer: dict[Any, np.ndarray], most: int) -> tuple[dict[Any, np.ndarray], np.ndarray]:
+    order = sorted(layer, key=lambda state: -layer[state].max())
+    return {state: layer[state] for state in order[:most]}, sum(layer[state] for state in order[most:])
+
+
+def _expected(sizes: list[int], candidates: int) -> int:
+    """Return how many states the next layer will have, judged by the growth so far."""
+    growth = sizes[-1] / sizes[-2] if len(sizes) > 1 else candidates
+    return int(min(candidates, 1.2 * growth * sizes[-1]))
+
+
+def _extrapolated(sizes: list[int], expected: int, further: int) -> float:
+    return expected * (expected / sizes[-1]) ** max(0, further)
+
+
+def _check_size(
+    states: int, expected: int, drawn: list[Event], options: int, number: int, step: int, request: Request
+) -> None:
+    instead = "use --method optimal or --method monte-carlo, fewer steps or fewer agents"
+    if options ** len(drawn) > MOST_CELLS >> 4:
+        raise TooManyError(
+            f"one exchange of {request.agents} agents has {options ** len(drawn):.3g} outcomes, the whole {number:.3g}, "
+            f"too many to list: {instead}"
+        )
+    if expected > request.most and not request.prune:
+        raise TooManyError(
+            f"{number:.3g} outcomes make about {expected} different graphs by step {step}, more than --max-graphs "
+            f"{request.most}: raise it, leave the least likely out with --prune, or {instead}"
+        )
+
+
+def _ending(
+    estimator: Estimator, layer: dict[Any, Any], last: list[Event], degree: int, events: int, request: Request
+) -> Ending:
+    """Carry out the last exchange for every state: one view per agent."""
+    weights, views = request.weights, []
+    exchanges = [estimator.exchange(state) for state in layer]
+    for group, agents in enumerate(request.groups):
+        for agent in agents:
+            concerned = [e._replace(receivers=(agent,)) for e in concerning(last, [agent])]
+            possible = outcomes(concerned, request.agents, request.delay, 0, weights)
+            ids = np.array([[x.fused(agent, o.heard[agent]) for o in possible] for x in exchanges])
+            factors = weights.factors([o.factor for o in possible], len(concerned))
+            share = weights.factors([weights.none()], 0)[0] / len(agents)
+            shares = [share if g == group else None for g in range(len(request.groups))]
+            cells = np.arange(len(possible))
+            views.append(View(ids, ((1, cells),), cells, factors, shares))
+    return Ending(weights.table(list(layer.values()), degree), views, events)
+
+
+def _two_step_ending(
+    estimator: Estimator,
+    layer: dict[Any, Any],
+    before: list[Event],
+    last: list[Event],
+    degree: int,
+    events: int,
+    request: Request,
+) -> Ending:
+    """The last two exchanges for every state, through the lattice of what can be common."""
+    weights, n = request.weights, request.agents
+    table = _Table(estimator, n)
+    views = []
+    for fused, shares in _last_heard(last, request).items():
+        members = [i for i in range(n) if fused >> i & 1]
+        concerned = concerning(before, members)
+        if len(concerned) > MOST_CELLS.bit_length() - 1:
+            raise TooManyError(
+                f"two exchanges of {n} agents have more outcomes than can be listed: use --method optimal or --method "
+                "monte-carlo, or fewer agents"
+            )
+        heard, factor_of, factors = _cells(concerned, members, weights)
+        order = np.argsort(factor_of, kind="stable")
+        starts = np.searchsorted(factor_of[order], np.arange(len(factors)))
+        heard = {i: h[order] for i, h in heard.items()}
+        terms = [(1, table.local(i, heard[i])) for i in members]
+        for size in range(2, len(members) + 1):
+            sign = 1 if size % 2 else -1
+            terms += [(sign, table.common([heard[i] for i in T])) for T in combinations(members, size)]
+        views.append((terms, starts, factors, shares))
+    ids = np.array([table.values(estimator.exchange(state)) for state in layer])
+    made = [View(ids, tuple((s, i) for s, i in terms if i is not None), *rest) for terms, *rest in views]
+    return Ending(weights.table(list(layer.values()), degree), made, events)
+
+
+def _last_heard(last: list[Event], request: Request) -> dict[int, list[Any]]:
+    """What an agent can fuse in the last exchange, with the weight for every group of agents."""
+    found: dict[int, list[Any]] = {}
+    weights = request.weights
+    for group, agents in enumerate(request.groups):
+        degree = max(len(concerning(last, [agent])) for agent in agents)
+        for agent in agents:
+            concerned = [e._replace(receivers=(agent,)) for e in concerning(last, [agent])]
+            for outcome in outcomes(concerned, request.agents, (1.0,), 0, weights):
+                shares = found.setdefault(outcome.heard[agent], [None] * len(request.groups))
+                share = weights.completed(weights.factors([outcome.factor], len(concerned))[0], degree)
+                shares[group] = share / len(agents) + (0 if shares[group] is None else shares[group])
+    return found
+
+
+def _cells(
+    drawn: list[Event], members: Sequence[int], weights: Weights
+) -> tuple[dict[int, np.ndarray], np.ndarray, np.ndarray]:
+    """All outcomes of some events: what each member hears, the factor's number, and the factors."""
+    cells = np.arange(1 << len(drawn))
+    heard = {i: np.full(len(cells), 1 << i) for i in members}
+    for bit, event in enumerate(drawn):
+        for i in set(event.receivers) & set(members):
+            heard[i] |= (cells >> bit & 1) << event.sender
+    if isinstance(weights, Rows):
+        factors = np.ones((1, weights.rows))
+        for event in drawn:
+            factors = np.concatenate([factors * (1.0 - event.probability), factors * event.probability])
+        possible = np.flatnonzero(factors.any(axis=1))
+        return {i: h[possible] for i, h in heard.items()}, np.arange(len(possible)), factors[possible]
+    successes = np.zeros(len(cells), dtype=int)
+    for bit in range(len(drawn)):
+        successes += cells >> bit & 1
+    return heard, successes, np.eye(len(drawn) + 1)
+
+
+class _Table:
+    """Numbers the local estimates and the common pedigrees that the views of a step need."""
+
+    def __init__(self, estimator: Estimator, agents: int) -> None:
+        self.estimator = estimator
+        self._locals: dict[tuple[int, int], int] = {}
+        self._common: dict[int, int] = {}
+        self._clauses: list[tuple[int, ...]] = []
+        self._removes = estimator.removes
+        points = np.arange(1 << agents, dtype=np.uint64)
+        variables = [
+            sum((1 << int(p)) for p in points if int(p) >> i & 1) for i in range(agents)
+        ]
+        self._truth = np.zeros(1 << agents, dtype=np.uint64)
+        for i, variable in enumerate(variables):
+            with_i = (points >> np.uint64(i) & np.uint64(1)).astype(bool)
+            self._truth[with_i] |= np.uint64(variable)
+
+    def local(self, agent: int, heard: np.ndarray) -> np.ndarray:
+        """Index of the agent's next local estimate after each heard set."""
+        source = self.estimator.sources[agent]
+        found, where = np.unique(heard, return_inverse=True)
+        return np.array([self._locals.setdefault((source, h), len(self._locals)) for h in found.tolist()])[where]
+
+    def common(self, heard: Sequence[np.ndarray]) -> np.ndarray | None:
+        """Index of what agents with those heard sets have in common (counted after the local estimates)."""
+        if not self._removes:
+            return None
+        meet = np.bitwise_and.reduce([self._truth[h] for h in heard])
+        found, first, where = np.unique(meet, return_index=True, return_inverse=True)
+        for table, cell in zip(found.tolist(), first.tolist(), strict=True):
+            if table not in self._common:
+                self._common[table] = -2 - len(self._clauses)
+                self._clauses.append(tuple({int(h[cell]) for h in heard}))
+        return np.array([self._common[table] for table in found.tolist()])[where]
+
+    def values(self, exchange: Any) -> list[int]:
+        """Values of one state, local estimates first, commons from the end: index −2 − i is common i, −1 nothing."""
+        ledger = self.estimator.ledger
+        locals_ = [ledger.local(exchange.union(heard), source) for source, heard in self._locals]
+        step = ledger.step[locals_[0]]
+        commons = [exchange.common(clauses) for clauses in self._clauses]
+        brought = [-1 if value is None else ledger.forward(value, step) for value in commons]
+        return [*locals_, *reversed(brought), -1]
+
+
+def claimed(ending: Ending, values: Information) -> Iterator[tuple[View, slice, Estimate]]:
+    """What is claimed in every outcome, a chunk of states at a time.
+
+    Parameters
+    ----------
+    values : information of every value of the ledger.
+
+    Yields
+    ------
+    view, states, estimate
+        Estimate of P (states, cells, d, d) and, if the values have states, x (states, cells, d, 1).
+    """
+    d = values.Y.shape[-1]
+    Y = np.concatenate([values.Y, np.zeros((1, d, d))])
+    y = None if values.y is None else np.concatenate([values.y, np.zeros((1, d, 1))])
+    for view in ending.views:
+        cells = len(view.terms[0][1])
+        size = max(1, CHUNK // (cells * d * d))
+        for first in range(0, len(view.ids), size):
+            states = slice(first, first + size)
+            ids = view.ids[states]
+            total = _summed(Y, ids, view.terms)
+            _check_definite(total)
+            information = Information(None if y is None else _summed(y, ids, view.terms), total)
+            yield view, states, from_information(information)
+
+
+def _summed(values: np.ndarray, ids: np.ndarray, terms: tuple[tuple[int, np.ndarray], ...]) -> np.ndarray:
+    total: Any = 0
+    for sign, index in terms:
+        total = total + sign * values[ids[:, index]]
+    return total
+
+
+def _check_definite(Y: np.ndarray) -> None:
+    try:
+        fine = bool((Y > 0).all()) if Y.shape[-1] == 1 else np.isfinite(np.linalg.cholesky(Y)).all()
+    except np.linalg.LinAlgError:
+        fine = False
+    if not fine:
+        raise NoAnswerError(
+            "the information claimed in some outcome is not positive definite: what is taken for common exceeds what is known"
+        )
+
+
+def expectation(ending: Ending, values: Information, weights: Weights, groups: int) -> list[Estimate]:
+    """Expected state and covariance per group of agents, (48)/(49), on the weights' axis.
+
+    Returns
+    -------
+    list of Estimate
+        P of shape (width, d, d): coefficients A_c of the polynomial in µ, or one matrix per row; x (width, d, 1) or None.
+    """
+    sums: list[list[Any]] = [[None, None] for _ in range(groups)]
+    for view, states, estimate in claimed(ending, values):
+        for place, value in enumerate(estimate):
+            if value is None:
+                continue
+            by_factor = np.add.reduceat(value, view.starts, axis=1)
+            total = weights.total(ending.weights[states], view.factors, by_factor)
+            for group, share in enumerate(view.shares):
+                if share is not None:
+                    part = weights.completed(weights.weighed(total, share), ending.events)
+                    known = sums[group][place]
+                    sums[group][place] = part if known is None else known + part
+    return [Estimate(*pair) for pair in sums]

@@ -1,0 +1,87 @@
+"""Estimators: what the agents do with what arrives, one file each, behind one protocol.
+
+An engine drives an estimator through the steps.  `start` is the state before the first exchange; `exchange` opens the
+exchange of one step; from there `fused` tells what an agent makes of what it heard and `after` goes on to the next
+step.  Numbers of agents are bits of a mask: heard = 0b101 means that agents 0 and 2 were heard.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from typing import Any, NamedTuple, Protocol
+
+from stochfuse.information import Ledger
+
+
+class Late(NamedTuple):
+    """A message that will arrive after some steps."""
+
+    receiver: int
+    delay: int
+    sender: int
+
+
+class Exchange(Protocol):
+    """One step's exchange of local estimates."""
+
+    def fused(self, agent: int, heard: int) -> int:
+        """Value, in the estimator's ledger, of what an agent claims after hearing some agents (itself included)."""
+        ...
+
+    def after(self, heard: Sequence[int], late: Sequence[Late] = (), *, merge: bool = True) -> Hashable:
+        """State before the next exchange; with `merge`, equal states are those that will behave alike from here on."""
+        ...
+
+    def union(self, heard: int) -> int:
+        """Value of what would be fused from the agents heard, whoever hears them (no message under way)."""
+        ...
+
+    def common(self, clauses: Sequence[int]) -> int | None:
+        """Value of what agents with those heard sets have in common, None if the estimator removes nothing."""
+        ...
+
+
+class Estimator(Protocol):
+    """What the agents do with what arrives.
+
+    Attributes
+    ----------
+    ledger : where values are written.
+    sources : source (of start and measurements) of every agent.
+    removes : whether anything is taken for common and removed.
+    """
+
+    ledger: Ledger
+    sources: tuple[int, ...]
+    removes: bool
+
+    def start(self) -> Any:
+        """State before the first exchange."""
+        ...
+
+    def exchange(self, state: Any) -> Exchange:
+        """Open the exchange of the state's step."""
+        ...
+
+
+def best_relabelling(
+    invariants: Sequence[Hashable], relabellings: Sequence[tuple[int, ...]]
+) -> list[tuple[int, ...]]:
+    """Return the relabellings of like agents that put invariants into their least order.
+
+    Parameters
+    ----------
+    invariants : one comparable per agent, the same whatever the agents are called.
+    relabellings : permutations that change nothing in the network; place a of the new order is taken by agent p[a].
+    """
+    if len(relabellings) == 1:
+        return list(relabellings)
+    best: list[tuple[int, ...]] = []
+    least: Any = None
+    for p in relabellings:
+        order = [invariants[a] for a in p]
+        if least is None or order < least:
+            best, least = [p], order
+        elif order == least:
+            best.append(p)
+    return best

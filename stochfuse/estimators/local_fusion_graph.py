@@ -1,0 +1,302 @@
+"""The Local Fusion Graph, thesis chapter 2 and appendix A: the common information of every set of estimates.
+
+Nodes are local estimates.  The parents of node (i, k+1) are (i, k) and every node that i received at step k; a node
+comes with its whole pedigree.  What a pedigree, a set D of nodes closed under ancestors, is worth at the step t of its
+latest node:
+
+    fuse(D) = Σ over non-empty T ⊆ max(D) of (−1)^(|T|+1) · [ fuse(∩ anc(s), s ∈ T) brought forward to t ]        (1)–(3)
+
+where max(D) are the nodes of D without a descendant in D and fuse of one node's pedigree is that node's information.
+This is the six-step search of section 2.4 with the three valuation rules of appendix A: one common node is brought
+forward; several of one step are fused there and then brought forward; several of different steps are brought to the
+latest one's step, fused, and brought forward.  Agent i's fused estimate is fuse of everything that it knows.  Delayed
+and out-of-order messages need nothing new.
+
+Departures from the source.  The search is written on pedigrees (bit masks) instead of the pointers of figures 6–15; equal
+intersections are counted together before anything is evaluated, which is how (19) becomes (20).
+
+Which states behave alike.  A later search only meets nodes that are maximal in an intersection of two or more
+pedigrees: of agents, of messages under way, or of nodes met before.  (The maximal elements of a union of pedigrees are
+among the maximal elements of each, so that intersections of two suffice.)  `merge` drops all other nodes, forgets who
+made the rest (their value says all that is used), and takes like agents in one order.  The order is a relabelling
+of the true state whatever it is, so that states found equal are; the property tests compare with plain enumeration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+from stochfuse.estimators import Late, best_relabelling
+from stochfuse.information import Ledger
+
+
+class Agent(NamedTuple):
+    """An agent before an exchange: value of its local estimate and the pedigree it rests on, as a mask of nodes."""
+
+    value: int
+    known: int
+
+
+class State(NamedTuple):
+    """What is known before an exchange.
+
+    Parameters
+    ----------
+    nodes : value and pedigree (itself included) of every older node that can still matter, ancestors first.
+    agents : one per agent.
+    late : (receiver, steps until it arrives, pedigree) of messages under way.
+    """
+
+    nodes: tuple[tuple[int, int], ...]
+    agents: tuple[Agent, ...]
+    late: tuple[tuple[int, int, int], ...] = ()
+
+
+class Pedigrees:
+    """Nodes with their ancestors, and what any set of them is worth.
+
+    Parameters
+    ----------
+    ledger : where values are written.
+    values : value of each node.
+    below : pedigree of each node, itself included, as a mask; every ancestor has a smaller number.
+    """
+
+    def __init__(self, ledger: Ledger, values: Sequence[int], below: Sequence[int]) -> None:
+        self.ledger, self.values, self.below = ledger, values, below
+        self._known: dict[int, int] = {}
+
+    def maximal(self, mask: int) -> Iterator[int]:
+        """Nodes of a mask without a descendant in it, latest first."""
+        while mask:
+            top = mask.bit_length() - 1
+            yield top
+            mask &= ~self.below[top]
+
+    def terms(self, mask: int) -> dict[int, int]:
+        """Inclusion–exclusion (1) over the maximal nodes: coefficient of every intersection that does not cancel."""
+        terms: dict[int, int] = {}
+        for top in self.maximal(mask):
+            below = self.below[top]
+            found = {below: 1}
+            for other, coefficient in terms.items():
+                shared = other & below
+                if shared:
+                    found[shared] = found.get(shared, 0) - coefficient
+            for shared, coefficient in found.items():
+                terms[shared] = terms.get(shared, 0) + coefficient
+        return {shared: coefficient for shared, coefficient in terms.items() if coefficient}
+
+    def fuse(self, mask: int) -> int:
+        """Value of a pedigree at its latest node's step."""
+        known = self._known.get(mask)
+        if known is None:
+            top = mask.bit_length() - 1
+            if mask == self.below[top]:
+                known = self.values[top]
+            else:
+                step = max(self.ledger.step[self.values[node]] for node in self.maximal(mask))
+                terms = [(self.fuse(shared), times) for shared, times in self.terms(mask).items()]
+                known = self.ledger.combine(step, terms)
+            self._known[mask] = known
+        return known
+
+
+class LocalFusionGraph:
+    """The estimator.
+
+    Parameters
+    ----------
+    ledger : where values are written.
+    sources : source (of start and measurements) of every agent.
+    shared : whether all agents start from one common estimate.
+    relabellings : permutations of the agents that leave network and sources as they are.
+    """
+
+    removes = True
+
+    def __init__(
+        self,
+        ledger: Ledger,
+        sources: Sequence[int],
+        *,
+        shared: bool = False,
+        relabellings: Sequence[tuple[int, ...]] | None = None,
+    ) -> None:
+        self.ledger, self.sources, self.shared = ledger, tuple(sources), shared
+        self.relabellings = relabellings or [tuple(range(len(self.sources)))]
+
+    def start(self) -> State:
+        """Everyone's initial estimate; a shared one is a common ancestor of all."""
+        if self.shared:
+            root = self.ledger.start(self.sources[0])
+            return State(((root, 1),), tuple(Agent(root, 1) for _ in self.sources))
+        return State((), tuple(Agent(self.ledger.start(source), 0) for source in self.sources))
+
+    def exchange(self, state: State) -> GraphExchange:
+        """Open the exchange of the state's step."""
+        return GraphExchange(self, state)
+
+
+class GraphExchange:
+    """One exchange: the agents' nodes are numbered after the older ones."""
+
+    def __init__(self, estimator: LocalFusionGraph, state: State) -> None:
+        self.estimator, self.state = estimator, state
+        older = len(state.nodes)
+        self.current = [agent.known | 1 << older + i for i, agent in enumerate(state.agents)]
+        self.pedigrees = Pedigrees(
+            estimator.ledger,
+            [value for value, _ in state.nodes] + [agent.value for agent in state.agents],
+            [below for _, below in state.nodes] + self.current,
+        )
+        self._unions: dict[int, int] = {}
+        self._due = [0] * len(state.agents)
+        for receiver, left, mask in state.late:
+            if left == 0:
+                self._due[receiver] |= mask
+
+    def union(self, heard: int) -> int:
+        """Value of what the agents heard know together."""
+        return self.pedigrees.fuse(self.mask(heard))
+
+    def common(self, clauses: Sequence[int]) -> int | None:
+        """Value of what agents that heard those sets have in common, None if nothing."""
+        mask = -1
+        for heard in clauses:
+            mask &= self.mask(heard)
+        return self.pedigrees.fuse(mask) if mask else None
+
+    def fused(self, agent: int, heard: int) -> int:
+        """Value that an agent claims after hearing some agents, with what else is due."""
+        return self.pedigrees.fuse(self.known(agent, heard))
+
+    def known(self, agent: int, heard: int) -> int:
+        """Pedigree of an agent after hearing some agents, with what else is due."""
+        return self.mask(heard) | self._due[agent]
+
+    def mask(self, heard: int) -> int:
+        """Union of the pedigrees of some agents."""
+        known = self._unions.get(heard)
+        if known is None:
+            known = 0
+            for i, current in enumerate(self.current):
+                if heard >> i & 1:
+                    known |= current
+            self._unions[heard] = known
+        return known
+
+    def after(self, heard: Sequence[int], late: Sequence[Late] = (), *, merge: bool = True) -> State:
+        """State before the next exchange."""
+        known = [self.known(i, h) for i, h in enumerate(heard)]
+        fused = [self.pedigrees.fuse(mask) for mask in known]
+        ledger, sources = self.estimator.ledger, self.estimator.sources
+        agents = [Agent(ledger.local(v, s), mask) for v, s, mask in zip(fused, sources, known, strict=True)]
+        waiting: dict[tuple[int, int], int] = {}
+        if late or self.state.late:
+            under_way = [(r, left - 1, mask) for r, left, mask in self.state.late if left > 0]
+            under_way += [(m.receiver, m.delay - 1, self.current[m.sender]) for m in late]
+            for receiver, left, mask in under_way:
+                if mask & ~known[receiver]:  # what is known already will change nothing
+                    waiting[receiver, left] = waiting.get((receiver, left), 0) | mask
+        if not merge:
+            nodes = tuple(zip(self.pedigrees.values, self.pedigrees.below, strict=True))
+            return State(nodes, tuple(agents), tuple((r, left, mask) for (r, left), mask in waiting.items()))
+        return self._merged(agents, waiting)
+
+    def _merged(self, agents: Sequence[Agent], waiting: dict[tuple[int, int], int]) -> State:
+        kept = self._reachable([agent.known for agent in agents], list(waiting.values()))
+        nodes = [node for node in range(kept.bit_length()) if kept >> node & 1]
+        values, below, step = self.pedigrees.values, self.pedigrees.below, self.estimator.ledger.step
+        holders = [0] * len(nodes)
+        for i, agent in enumerate(agents):
+            for place, node in enumerate(nodes):
+                if agent.known >> node & 1:
+                    holders[place] |= 1 << i
+        carried = [
+            tuple(sorted((r, left) for (r, left), mask in waiting.items() if mask >> node & 1)) if waiting else ()
+            for node in nodes
+        ]
+        # ancestors first: an earlier step, or fewer ancestors within one
+        rank = [(step[values[node]], (below[node] & kept).bit_count(), values[node]) for node in nodes]
+        invariants = [
+            (
+                agent.value,
+                self.estimator.sources[i],
+                sorted((rank[p], holders[p].bit_count()) for p in range(len(nodes)) if holders[p] >> i & 1),
+                sorted(left for r, left in waiting if r == i),
+            )
+            for i, agent in enumerate(agents)
+        ]
+        best: State | None = None
+        for order in best_relabelling(invariants, self.estimator.relabellings):
+            place_of = [0] * len(order)
+            for place, i in enumerate(order):
+                place_of[i] = place
+            keys = []
+            for p in range(len(nodes)):
+                who = sum(1 << place_of[i] for i in range(len(order)) if holders[p] >> i & 1)
+                what = tuple(sorted((place_of[r], left) for r, left in carried[p])) if carried[p] else ()
+                keys.append((rank[p], who, what))
+            sequence = _sequence(keys, nodes, below)
+            new = {nodes[p]: place for place, p in enumerate(sequence)}
+            state = State(
+                tuple((values[nodes[p]], _moved(below[nodes[p]] & kept, new)) for p in sequence),
+                tuple(Agent(agents[i].value, _moved(agents[i].known & kept, new)) for i in order),
+                tuple(sorted((place_of[r], left, _moved(m & kept, new)) for (r, left), m in waiting.items())),
+            )
+            if best is None or state < best:
+                best = state
+        if best is None:
+            raise ValueError("no relabelling given")
+        return best
+
+    def _reachable(self, known: Sequence[int], messages: Sequence[int]) -> int:
+        """Nodes that a later search can meet."""
+        below = self.pedigrees.below
+        kept, done = 0, set()
+        for mask in messages:  # a message's own node is met when it arrives
+            for node in self.pedigrees.maximal(mask):
+                kept |= 1 << node
+        members = [*known, *messages, *(below[n] for n in range(kept.bit_length()) if kept >> n & 1)]
+        i = 1
+        while i < len(members):
+            mask = members[i]
+            for other in members[:i]:
+                shared = mask & other
+                if shared in done:
+                    continue
+                done.add(shared)
+                while shared:
+                    top = shared.bit_length() - 1
+                    if not kept >> top & 1:
+                        kept |= 1 << top
+                        members.append(below[top])
+                    shared &= ~below[top]
+            i += 1
+        return kept
+
+
+def _sequence(keys: list[tuple], nodes: list[int], below: Sequence[int]) -> list[int]:
+    """Places of nodes in the order of their keys, equal ones by the keys of their ancestors and descendants."""
+    if len(set(keys)) == len(keys):
+        return sorted(range(len(keys)), key=keys.__getitem__)
+    kin = [
+        (
+            key,
+            sorted(keys[q] for q, other in enumerate(nodes) if below[nodes[p]] >> other & 1),
+            sorted(keys[q] for q, other in enumerate(nodes) if below[other] >> nodes[p] & 1),
+        )
+        for p, key in enumerate(keys)
+    ]
+    return sorted(range(len(keys)), key=kin.__getitem__)
+
+
+def _moved(mask: int, new: dict[int, int]) -> int:
+    moved = 0
+    while mask:
+        top = mask.bit_length() - 1
+        moved |= 1 << new[top]
+        mask ^= 1 << top
+    return moved

@@ -1,0 +1,98 @@
+"""Naive fusion, thesis (42)/(43): add up what arrives and subtract nothing.
+
+    P_j⁻¹(k) = Σ P_i⁻¹(k|k)      P_j⁻¹(k) x̂_j(k) = Σ P_i⁻¹(k|k) x̂_i(k|k)      over what agent j heard, itself included
+
+Right only where the estimates are independent; what they share is counted again at every exchange, so that the claimed
+covariance falls below what any estimator can reach.  A late message is brought forward and added too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from stochfuse.estimators import Late, best_relabelling
+from stochfuse.information import Ledger
+
+
+class State(NamedTuple):
+    """Before an exchange: the agents' local estimates, and (receiver, steps left, estimate) of messages under way."""
+
+    agents: tuple[int, ...]
+    late: tuple[tuple[int, int, int], ...] = ()
+
+
+class NaiveFusion:
+    """The estimator; parameters are those of `LocalFusionGraph`.  A shared start is not recognised as such."""
+
+    removes = False
+
+    def __init__(
+        self,
+        ledger: Ledger,
+        sources: Sequence[int],
+        *,
+        shared: bool = False,
+        relabellings: Sequence[tuple[int, ...]] | None = None,
+    ) -> None:
+        self.ledger, self.sources = ledger, tuple(sources)
+        self.relabellings = relabellings or [tuple(range(len(self.sources)))]
+
+    def start(self) -> State:
+        """Everyone's initial estimate."""
+        return State(tuple(self.ledger.start(source) for source in self.sources))
+
+    def exchange(self, state: State) -> NaiveExchange:
+        """Open the exchange of the state's step."""
+        return NaiveExchange(self, state)
+
+
+class NaiveExchange:
+    """One exchange."""
+
+    def __init__(self, estimator: NaiveFusion, state: State) -> None:
+        self.estimator, self.state = estimator, state
+        self._step = estimator.ledger.step[state.agents[0]]
+        self._due: list[list[int]] = [[] for _ in state.agents]
+        for receiver, left, value in state.late:
+            if left == 0:
+                self._due[receiver].append(value)
+        self._fused: dict[int, int] = {}
+
+    def union(self, heard: int) -> int:
+        """Value of the sum of the agents heard."""
+        known = self._fused.get(heard)
+        if known is None:
+            terms = [(value, 1) for i, value in enumerate(self.state.agents) if heard >> i & 1]
+            known = self._fused[heard] = self.estimator.ledger.combine(self._step, terms)
+        return known
+
+    def common(self, clauses: Sequence[int]) -> int | None:
+        """Nothing is taken for common."""
+        return None
+
+    def fused(self, agent: int, heard: int) -> int:
+        """Value that an agent claims after hearing some agents, with what else is due."""
+        if not self._due[agent]:
+            return self.union(heard)
+        terms = [(self.union(heard), 1), *((value, 1) for value in self._due[agent])]
+        return self.estimator.ledger.combine(self._step, terms)
+
+    def after(self, heard: Sequence[int], late: Sequence[Late] = (), *, merge: bool = True) -> State:
+        """State before the next exchange."""
+        ledger, sources = self.estimator.ledger, self.estimator.sources
+        agents = [ledger.local(self.fused(i, h), sources[i]) for i, h in enumerate(heard)]
+        under_way = [(r, left - 1, value) for r, left, value in self.state.late if left > 0]
+        under_way += [(m.receiver, m.delay - 1, self.state.agents[m.sender]) for m in late]
+        if not merge:
+            return State(tuple(agents), tuple(under_way))
+        invariants = [
+            (agents[i], sources[i], sorted((left, value) for r, left, value in under_way if r == i))
+            for i in range(len(agents))
+        ]
+        states = []
+        for order in best_relabelling(invariants, self.estimator.relabellings):
+            place = {i: p for p, i in enumerate(order)}
+            late_now = tuple(sorted((place[r], left, value) for r, left, value in under_way))
+            states.append(State(tuple(agents[i] for i in order), late_now))
+        return min(states)

@@ -1,0 +1,322 @@
+"""What may arrive in a step, and how likely: the events of (44)–(46).
+
+A step draws independent events: every ordered pair of agents in an ad hoc network, every sender in a broadcast one, every
+agent's one link in a cyclic one.  An event succeeds with probability µ, and everyone it concerns then hears the
+sender, at once or after a delay that is drawn with it.  Sets of agents are masks, bit i for agent i.
+
+With equal µ everywhere, an outcome with c successes of L events has probability µ^c (1−µ)^(L−c): the `Counts` and
+`Coefficients` weights keep the factor of every c apart (theory section 5), so that one enumeration answers every µ.
+`Rows` keeps one probability per row of link probabilities instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import permutations
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from stochfuse.estimators import Late
+from stochfuse.network import LinkRows, Network, possible_senders
+
+MOST_AGENTS_RELABELLED = 7
+"""Agents up to which relabellings are looked for: their number grows with the factorial."""
+
+
+class Event(NamedTuple):
+    """One draw of a step: who sends, who hears it, and with which probability in each row."""
+
+    sender: int
+    receivers: tuple[int, ...]
+    probability: np.ndarray
+
+
+class Fate(NamedTuple):
+    """What became of an event: a delay, or None if nothing will come of it; and the weight of that."""
+
+    delay: int | None
+    missed: Any
+    arrived: Any
+
+
+class Outcome(NamedTuple):
+    """Which agents each agent hears in a step (itself included), what is under way, and the outcome's factor."""
+
+    heard: tuple[int, ...]
+    late: tuple[Late, ...]
+    factor: Any
+
+
+def events(network: Network, rows: LinkRows, step: int) -> list[Event]:
+    """Events of a step, those that are impossible in every row left out where links differ."""
+    n, senders = network.agents, possible_senders(network.architecture, network.agents)
+    µ = rows.matrices(network, step)
+    if network.architecture == "broadcast":
+        place = {(i, j): p for i in range(n) for p, j in enumerate(senders[i])}
+        listeners = {j: tuple(i for i in range(n) if i != j) for j in range(n)}
+        found = [Event(j, heard, µ[:, heard[0], place[heard[0], j]]) for j, heard in listeners.items() if heard]
+    else:
+        found = [
+            Event(int(j), (i,), µ[:, i, p]) for i in range(n) for p, j in enumerate(senders[i])
+        ]
+    # with one µ for all links the answer is a polynomial in µ, whatever values of µ are asked for
+    return [event for event in found if rows.uniform or (event.probability > 0).any()]
+
+
+def fates(delay: Sequence[float], left: int) -> list[Fate]:
+    """What may become of an event with so many steps left: lost or too late, or heard after each possible delay."""
+    in_time = delay[: left + 1]
+    too_late = 1.0 - sum(in_time) if left + 1 < len(delay) else 0.0
+    return [Fate(None, 1.0, too_late), *(Fate(d, 0.0, p) for d, p in enumerate(in_time) if p > 0)]
+
+
+def relabellings(network: Network, rows: LinkRows, sources: Sequence[int]) -> list[tuple[int, ...]]:
+    """Permutations of the agents that change neither sources, nor who may hear whom, nor how likely."""
+    n = network.agents
+    if n > MOST_AGENTS_RELABELLED:
+        return [tuple(range(n))]
+    steps = range(1, network.steps + 1 if rows.varies else 2)
+    link = np.zeros((len(steps), len(rows.link), n, n))
+    for k, step in enumerate(steps):
+        for i, (senders, µ) in enumerate(
+            zip(possible_senders(network.architecture, n), np.moveaxis(rows.matrices(network, step), 1, 0), strict=True)
+        ):
+            link[k][:, i, senders] = µ + 1.0  # told apart from a link that does not exist
+    found = []
+    for p in permutations(range(n)):
+        order = list(p)
+        if all(sources[a] == sources[i] for i, a in enumerate(p)) and (link == link[..., order, :][..., order]).all():
+            found.append(p)
+    return found
+
+
+def orbits(n: int, permutations: Sequence[tuple[int, ...]]) -> list[tuple[int, ...]]:
+    """Agents that some relabelling takes into one another, as sorted groups."""
+    group = list(range(n))
+    for p in permutations:
+        for i, a in enumerate(p):
+            low, high = sorted((group[i], group[a]))
+            group = [low if g == high else g for g in group]
+    return [tuple(i for i in range(n) if group[i] == g) for g in sorted(set(group))]
+
+
+class _Polynomial:
+    """Coefficients A_c of µ^c (1−µ)^(L−c) on an axis of L + 1 entries."""
+
+    def product(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Weights of two independent parts together."""
+        return np.convolve(a, b)
+
+    def total(self, states: np.ndarray, cells: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Σ states · cells · values over states and groups of cells, shape (degrees + 1, …)."""
+        flat = values.reshape(*values.shape[:2], -1)
+        first = np.tensordot(states.T, flat, axes=1)
+        pairs = np.einsum("hm,chv->cmv", cells, first)
+        out = np.zeros((sum(pairs.shape[:2]) - 1, pairs.shape[2]))
+        for c, row in enumerate(pairs):
+            out[c : c + len(row)] += row
+        return out.reshape(-1, *values.shape[2:])
+
+    def weighed(self, total: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """Σ_c total times an independent part's weight."""
+        out = np.zeros((len(total) + len(weight) - 1, *total.shape[1:]))
+        for c, w in enumerate(weight):
+            out[c : c + len(total)] += w * total
+        return out
+
+    def completed(self, total: np.ndarray, degree: int) -> np.ndarray:
+        """Return the same with events that do not matter counted in, so that L is the degree."""
+        while len(total) <= degree:
+            grown = np.zeros((len(total) + 1, *total.shape[1:]))
+            grown[:-1] += total
+            grown[1:] += total
+            total = grown
+        return total
+
+
+@dataclass(frozen=True)
+class Counts(_Polynomial):
+    """Weights by number of successes, equal µ: outcomes counted exactly, packed into one integer, `bits` apiece."""
+
+    bits: int
+
+    def one(self) -> int:
+        """Weight of the start."""
+        return 1
+
+    def factor(self, event: Event, fate: Fate) -> int:
+        """Shift of one event's fate."""
+        return 0 if fate.delay is None else self.bits
+
+    def both(self, a: int, b: int) -> int:
+        """Shift of two events together."""
+        return a + b
+
+    def none(self) -> int:
+        """Shift of no event."""
+        return 0
+
+    def times(self, weight: int, factor: int) -> int:
+        """Weight after an outcome."""
+        return weight << factor
+
+    def table(self, weights: Sequence[int], degree: int) -> np.ndarray:
+        """Numbers of outcomes by number of successes, shape (weights, degree + 1)."""
+        return np.array(self.exactly(weights, degree), dtype=float)
+
+    def exactly(self, weights: Sequence[int], degree: int) -> list[list[int]]:
+        """Return the same as integers."""
+        mask = (1 << self.bits) - 1
+        return [[w >> c * self.bits & mask for c in range(degree + 1)] for w in weights]
+
+    def factors(self, factors: Sequence[int], degree: int) -> np.ndarray:
+        """Outcomes' factors as coefficients, shape (factors, degree + 1)."""
+        return np.eye(degree + 1)[[factor // self.bits for factor in factors]]
+
+
+@dataclass(frozen=True)
+class Coefficients(_Polynomial):
+    """Weights by number of successes, equal µ with delays: coefficients of µ^c (1−µ)^(L−c)."""
+
+    def one(self) -> np.ndarray:
+        """Weight of the start, or of no event."""
+        return np.ones(1)
+
+    none = one
+
+    def factor(self, event: Event, fate: Fate) -> np.ndarray:
+        """Coefficients of one event's fate."""
+        return np.array([fate.missed, fate.arrived])
+
+    def both(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Coefficients of two events together."""
+        return np.convolve(a, b)
+
+    times = both
+
+    def table(self, weights: Sequence[np.ndarray], degree: int) -> np.ndarray:
+        """Coefficients, shape (weights, degree + 1)."""
+        return np.array(weights)
+
+    factors = table
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Weights as one probability per row."""
+
+    rows: int
+
+    def one(self) -> np.ndarray:
+        """Weight of the start, or of no event."""
+        return np.ones(self.rows)
+
+    none = one
+
+    def factor(self, event: Event, fate: Fate) -> np.ndarray:
+        """Probabilities of one event's fate."""
+        µ = event.probability
+        return fate.missed * (1.0 - µ) + fate.arrived * µ
+
+    def both(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Probabilities of two events together."""
+        return a * b
+
+    times = both
+    product = both
+
+    def table(self, weights: Sequence[np.ndarray], degree: int) -> np.ndarray:
+        """Probabilities, shape (weights, rows)."""
+        return np.array(weights)
+
+    factors = table
+
+    def total(self, states: np.ndarray, cells: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Σ states · cells · values over states and groups of cells, shape (rows, …)."""
+        flat = values.reshape(*values.shape[:2], -1)
+        return np.einsum("gr,hr,ghv->rv", states, cells, flat, optimize=True).reshape(-1, *values.shape[2:])
+
+    def weighed(self, total: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """Total times an independent part's weight."""
+        return total * weight.reshape(-1, *(1,) * (total.ndim - 1))
+
+    def completed(self, total: np.ndarray, degree: int) -> np.ndarray:
+        """Return the total: probabilities are complete."""
+        return total
+
+
+Weights = Counts | Coefficients | Rows
+
+
+def weights_for(network: Network, rows: LinkRows, number_of_events: int) -> Weights:
+    """Return the cheapest exact bookkeeping: by number of successes where all µ are equal, else by row."""
+    if not rows.uniform or rows.varies:
+        return Rows(len(rows.link))
+    return Counts(number_of_events + 1) if network.delay == (1.0,) else Coefficients()
+
+
+def outcomes(drawn: Sequence[Event], agents: int, delay: Sequence[float], left: int, weights: Weights) -> list[Outcome]:
+    """Every outcome of a step that has a positive probability in some row.
+
+    Parameters
+    ----------
+    drawn : the step's events.
+    left : steps left after this one; what arrives later does not matter.
+    """
+    choices = fates(delay, left)
+    whole = [Outcome(tuple(1 << i for i in range(agents)), (), weights.none())]
+    for event in drawn:
+        options = [(fate, weights.factor(event, fate)) for fate in choices]
+        if isinstance(weights, Rows):
+            options = [(fate, factor) for fate, factor in options if factor.any()]
+        whole = [
+            Outcome(
+                _heard(outcome.heard, event, fate),
+                outcome.late + _late(event, fate),
+                weights.both(outcome.factor, factor),
+            )
+            for outcome in whole
+            for fate, factor in options
+        ]
+    return whole
+
+
+def concerning(drawn: Sequence[Event], agents: Sequence[int]) -> list[Event]:
+    """Events that concern some agents."""
+    return [event for event in drawn if set(event.receivers) & set(agents)]
+
+
+def _heard(heard: tuple[int, ...], event: Event, fate: Fate) -> tuple[int, ...]:
+    if fate.delay != 0:
+        return heard
+    return tuple(h | 1 << event.sender if i in event.receivers else h for i, h in enumerate(heard))
+
+
+def _late(event: Event, fate: Fate) -> tuple[Late, ...]:
+    if not fate.delay:
+        return ()
+    return tuple(Late(receiver, fate.delay, event.sender) for receiver in event.receivers)
+
+
+def bernstein(coefficients: np.ndarray, degree: int, link: np.ndarray) -> np.ndarray:
+    """Σ_c A_c µ^c (1−µ)^(L−c) for every µ.
+
+    Parameters
+    ----------
+    coefficients : (degree + 1, ...) A_c.
+    link : (rows,) µ.
+
+    Returns
+    -------
+    ndarray
+        (rows, ...)
+    """
+    return np.tensordot(monomials(degree, link), coefficients, axes=1)
+
+
+def monomials(degree: int, link: np.ndarray) -> np.ndarray:
+    """µ^c (1−µ)^(L−c) for c = 0 … L, shape (rows, degree + 1)."""
+    c = np.arange(degree + 1)
+    return link[:, None] ** c * (1.0 - link[:, None]) ** (degree - c)

@@ -1,0 +1,256 @@
+"""The general stochastic formulation, thesis (44)–(49): every outcome, every common prior, exactly.
+
+    (49)  E[P(k)] = Σ_S µ_S µ_¬S P_S(k)        (48)  E[x̂(k)] = Σ_S µ_S µ_¬S x̂_S(k)
+
+over the outcomes S of "which messages arrive, in all steps up to k", (45)/(46).  P_S and x̂_S are what the Local Fusion Graph
+claims in that outcome (or naive fusion, (42)/(43), with its estimator).  With one µ for all links,
+
+    E[P(k)](µ) = Σ_c A_c µ^c (1−µ)^(L−c)
+
+is a polynomial whose coefficients are found once; with unequal µ_ij(k) every row of link probabilities is summed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from stochfuse.engines.enumeration import (
+    Progress,
+    Request,
+    Structure,
+    claimed,
+    enumerate_outcomes,
+    expectation,
+)
+from stochfuse.errors import NoAnswerError, UsageError
+from stochfuse.estimators.local_fusion_graph import LocalFusionGraph
+from stochfuse.estimators.naive import NaiveFusion
+from stochfuse.events import Rows, bernstein, events, monomials, orbits, relabellings, weights_for
+from stochfuse.information import Information, Ledger, Sources, evaluate
+from stochfuse.kalman import Estimate, to_information
+from stochfuse.metrics import Metric
+from stochfuse.network import LinkRows
+from stochfuse.scenario import Scenario
+
+ESTIMATORS = {"local-fusion-graph": LocalFusionGraph, "naive": NaiveFusion}
+MOST_GRAPHS = 100_000
+
+
+@dataclass(frozen=True, eq=False)
+class Outcomes:
+    """All outcomes of a scenario with what is claimed in each.
+
+    Parameters
+    ----------
+    scenario, rows : what was given.
+    groups : agents that are alike, as sorted tuples.
+    structure : the outcomes.
+    values : information of every value in the structure.
+    weights : bookkeeping of probabilities.
+    """
+
+    scenario: Scenario
+    rows: LinkRows
+    groups: tuple[tuple[int, ...], ...]
+    structure: Structure
+    values: Information
+    weights: Any
+
+    @property
+    def polynomial(self) -> bool:
+        """Whether the expectation is a polynomial in one link probability."""
+        return not isinstance(self.weights, Rows)
+
+    @cached_property
+    def expectations(self) -> list[list[Estimate]]:
+        """Expected estimate per step and group of agents, on the weights' axis (coefficients A_c, or rows)."""
+        return [
+            expectation(ending, self.values, self.weights, len(self.groups)) for ending in self.structure.endings
+        ]
+
+    def coefficients(self, step: int, group: int = 0) -> np.ndarray:
+        """A_0 … A_L of E[P(step)](µ) = Σ A_c µ^c (1−µ)^(L−c), shape (L + 1, d, d).
+
+        Raises
+        ------
+        UsageError
+            If links differ, so that there is no single µ.
+        """
+        if not self.polynomial:
+            raise UsageError("coefficients: expected one link probability for all links and steps, got different ones")
+        return self.expectations[step - 1][group].P
+
+    def covariance(self, link: np.ndarray | None = None) -> np.ndarray:
+        """Expected covariance, (rows, steps, groups, d, d), at the scenario's rows or at some link probabilities."""
+        return np.stack([np.stack([self._at(e.P, link) for e in step], axis=1) for step in self.expectations], axis=1)
+
+    def states(self) -> np.ndarray:
+        """Expected state estimates, (rows, steps, groups, d, 1), (48)."""
+        return np.stack([np.stack([self._at(e.x, None) for e in step], axis=1) for step in self.expectations], axis=1)
+
+    def derivative(self) -> np.ndarray:
+        """dE[P]/dµ at the scenario's rows, (rows, steps, groups, d, d)."""
+        µ = self.rows.link
+        out = []
+        for step in range(1, len(self.expectations) + 1):
+            by_group = []
+            for group in range(len(self.groups)):
+                A = self.coefficients(step, group)
+                L = len(A) - 1
+                c = np.arange(L + 1).reshape(-1, 1, 1)
+                # d/dµ Σ A_c µ^c (1−µ)^(L−c), by Bernstein's form of degree L − 1
+                slope = (c * A)[1:] - ((L - c) * A)[:-1] if L else np.zeros((1, *A.shape[1:]))
+                by_group.append(bernstein(slope, max(L - 1, 0), µ))
+            out.append(np.stack(by_group, axis=1))
+        return np.stack(out, axis=1)
+
+    def distribution(self, metric: Metric, step: int, group: int = 0) -> Distribution:
+        """Values of a metric over all outcomes of a step, with their probabilities in every row."""
+        ending = self.structure.endings[step - 1]
+        values, weights = [], []
+        for view, states, estimate in claimed(ending, self.values):
+            share = view.shares[group]
+            if share is None:
+                continue
+            value = metric.of(estimate.P)
+            before = self._probability(ending.weights[states])
+            cells = np.repeat(self._probability(view.factors), np.diff([*view.starts, value.shape[1]]), axis=1)
+            values.append(value.ravel())
+            last = self._probability(share[None])
+            weights.append((before[:, :, None] * (cells * last)[:, None, :]).reshape(len(before), -1))
+        return Distribution.merged(np.concatenate(values), np.concatenate(weights, axis=1))
+
+    def _probability(self, table: np.ndarray) -> np.ndarray:
+        """Probabilities (rows, entries) of entries given on the weights' axis."""
+        return monomials(table.shape[1] - 1, self.rows.link) @ table.T if self.polynomial else table.T
+
+    def _at(self, expected: np.ndarray, link: np.ndarray | None) -> np.ndarray:
+        if not self.polynomial:
+            return expected
+        return bernstein(expected, len(expected) - 1, self.rows.link if link is None else link)
+
+
+@dataclass(frozen=True, eq=False)
+class Distribution:
+    """Distribution of a metric over the outcomes.
+
+    Parameters
+    ----------
+    values : (values,) different values, ascending.
+    probability : (rows, values) probability of each.
+    """
+
+    values: np.ndarray
+    probability: np.ndarray
+
+    @classmethod
+    def merged(cls, values: np.ndarray, weights: np.ndarray) -> Distribution:
+        """Take values together that differ by rounding only (1e-12 relative)."""
+        order = np.argsort(values, kind="stable")
+        values = values[order]
+        new = np.concatenate([[True], np.diff(values) > 1e-12 * np.abs(values[1:])])
+        starts = np.flatnonzero(new)
+        return cls(values[starts], np.add.reduceat(weights[:, order], starts, axis=1))
+
+    def mean(self) -> np.ndarray:
+        """Expected metric, (rows,): the mean of the metric, not the metric of the mean covariance."""
+        return self.probability @ self.values
+
+    def variance(self) -> np.ndarray:
+        """Variance of the metric over the outcomes, (rows,)."""
+        return (self.probability * (self.values - self.mean()[:, None]) ** 2).sum(axis=1)
+
+    def quantile(self, level: float) -> np.ndarray:
+        """Least value that is not exceeded with at least that probability, (rows,)."""
+        below = np.cumsum(self.probability, axis=1)
+        # a level that the sum reaches but for rounding counts as reached
+        return self.values[np.minimum((below < level - 1e-12).sum(axis=1), len(self.values) - 1)]
+
+    def at_most(self, limit: float) -> np.ndarray:
+        """P(metric ≤ limit), (rows,)."""
+        return self.probability[:, self.values <= limit + 1e-12 * abs(limit)].sum(axis=1)
+
+
+def outcomes(
+    scenario: Scenario,
+    rows: LinkRows,
+    estimator: str = "local-fusion-graph",
+    *,
+    records: np.ndarray | None = None,
+    max_graphs: int = MOST_GRAPHS,
+    prune: bool = False,
+    plain: bool = False,
+    progress: Progress | None = None,
+) -> Outcomes:
+    """Enumerate all outcomes of a scenario.
+
+    Parameters
+    ----------
+    rows : rows of link probabilities.
+    estimator : "local-fusion-graph" or "naive".
+    records : measurements (steps, agents, p) where states are wanted.
+    max_graphs : states that may be carried from step to step.
+    prune : leave the least likely states out where there are more.
+    plain : merge nothing.
+    progress : told how far the work is.
+
+    Raises
+    ------
+    UsageError
+        If the outcomes are too many, or a covariance has no inverse.
+    """
+    network = scenario.network
+    alike = records is None
+    labels = scenario.sensor_of if alike else tuple(range(network.agents))
+    ledger = Ledger()
+    permutations = relabellings(network, rows, labels)
+    made = ESTIMATORS[estimator](
+        ledger, labels, shared=scenario.correlation == "shared", relabellings=None if plain else permutations
+    )
+    per_step = [events(network, rows, step) for step in range(1, network.steps + 1)]
+    weights = Rows(len(rows.link)) if prune else weights_for(network, rows, sum(map(len, per_step)))
+    groups = tuple(orbits(network.agents, permutations))
+    request = Request(
+        agents=network.agents,
+        steps=network.steps,
+        delay=network.delay,
+        events=lambda step: per_step[step - 1],
+        weights=weights,
+        groups=groups,
+        most=max_graphs,
+        prune=prune,
+        plain=plain,
+    )
+    sources = sources_of(scenario, records)
+    structure = enumerate_outcomes(made, request, progress)
+    return Outcomes(scenario, rows, groups, structure, evaluate(ledger, sources), weights)
+
+
+def sources_of(scenario: Scenario, records: np.ndarray | None = None) -> Sources:
+    """Return what start and measurements of every source are worth.
+
+    Raises
+    ------
+    UsageError
+        If the initial covariance has no inverse.
+    """
+    x0 = None if records is None else scenario.x0
+    try:
+        start = to_information(Estimate(x0, scenario.P0))
+    except np.linalg.LinAlgError:
+        start = None
+    if start is None or not np.isfinite(start.Y).all():
+        raise UsageError("initial.P: expected an invertible covariance for the Local Fusion Graph, got a singular one")
+    if records is None:
+        return Sources(scenario.model, scenario.sensors, [start] * len(scenario.sensors))
+    sensors = [scenario.sensors[kind] for kind in scenario.sensor_of]
+    columns = [[z[..., None] for z in step] for step in records]
+    return Sources(scenario.model, sensors, [start] * len(sensors), columns)
+
+
+__all__ = ["Distribution", "NoAnswerError", "Outcomes", "Sequence", "outcomes", "sources_of"]
