@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fractions import Fraction
-from itertools import product
+from itertools import combinations, product
 from math import comb
 
 import mpmath as mp
@@ -125,3 +125,133 @@ def scaled_error(P, reference):
     unit = sd[..., :, None] * sd[..., None, :]
     error = np.abs(P - reference)
     return float(np.max(np.where(unit > 0, error / np.where(unit > 0, unit, 1.0), error)))
+
+
+class FusionGraph:
+    """The Local Fusion Graph as the thesis tells it: sets of nodes, recursion, inverses; no sharing of any result.
+
+    parents: node -> set of nodes; a node is (agent, step), or "root" for a shared start.  Estimates are (y, Y) pairs.
+    """
+
+    def __init__(self, parents, local, forward):
+        self.parents, self.local, self.forward = parents, local, forward
+
+    def ancestors(self, node):
+        found, queue = {node}, [node]
+        while queue:
+            for parent in self.parents.get(queue.pop(), ()):
+                if parent not in found:
+                    found.add(parent)
+                    queue.append(parent)
+        return found
+
+    def maximal(self, nodes):
+        return {s for s in nodes if not any(s != t and s in self.ancestors(t) for t in nodes)}
+
+    @staticmethod
+    def step(node):
+        return 1 if node == "root" else node[1]
+
+    def bring(self, pair, since, until):
+        for k in range(since + 1, until + 1):
+            pair = self.forward(pair, k)
+        return pair
+
+    def info(self, nodes, t):
+        y, Y = 0.0, 0.0
+        for size in range(1, len(nodes) + 1):
+            for T in combinations(sorted(nodes, key=str), size):
+                common = self.common(T, t)
+                if common is not None:
+                    y, Y = y + (-1) ** (size + 1) * common[0], Y + (-1) ** (size + 1) * common[1]
+        return y, Y
+
+    def common(self, T, t):
+        if len(T) == 1:
+            return self.bring(self.local(T[0]), self.step(T[0]), t)
+        M = self.maximal(set.intersection(*(self.ancestors(s) for s in T)))
+        if not M:
+            return None
+        latest = max(map(self.step, M))
+        return self.bring(self.info(M, latest), latest, t)
+
+
+class FusionNetwork:
+    """One history of a network, step by step, with the Local Fusion Graph or naively.
+
+    sensors: (H, R) per agent; records: z[step][agent] columns; history: per step a set of (sender, receiver, sent step).
+    """
+
+    def __init__(self, F, Q, sensors, P0, x0, records, history, shared=False, naive=False):
+        self.F, self.Q, self.sensors, self.records = F, Q, sensors, records
+        n = len(sensors)
+        Y0 = np.linalg.inv(P0)
+        root = (Y0 @ x0, Y0)
+        self.locals = {"root": root}
+        self.fused = {}
+        parents = {(i, 1): ({"root"} if shared else set()) for i in range(n)}
+        graph = FusionGraph(parents, lambda node: self.locals[node], self.forward)
+        for k, messages in enumerate(history, start=1):
+            for i in range(n):
+                self.locals[i, k] = root if k == 1 else self.measure(self.forward(self.fused[i, k - 1], k), i, k)
+            for i in range(n):
+                received = {(i, k)} | {(j, sent) for j, receiver, sent in messages if receiver == i}
+                if naive:
+                    pairs = [graph.bring(self.locals[s], s[1], k) for s in sorted(received)]
+                    self.fused[i, k] = (sum(y for y, _ in pairs), sum(Y for _, Y in pairs))
+                else:
+                    self.fused[i, k] = graph.info(graph.maximal(received), k)
+                parents[i, k + 1] = set(received)
+        self.graph = graph
+
+    def forward(self, pair, k):
+        y, Y = pair
+        P = np.linalg.inv(Y)
+        prior = np.linalg.inv(self.F @ P @ self.F.T + self.Q)
+        return prior @ self.F @ P @ y, prior
+
+    def measure(self, pair, i, k):
+        H, R = self.sensors[i]
+        return pair[0] + H.T @ np.linalg.inv(R) @ self.records[k - 1][i], pair[1] + H.T @ np.linalg.inv(R) @ H
+
+    def covariance(self, i, k):
+        return np.linalg.inv(self.fused[i, k][1])
+
+    def state(self, i, k):
+        return np.linalg.solve(self.fused[i, k][1], self.fused[i, k][0])
+
+
+def histories(n, steps, architecture, link, delay=(1.0,)):
+    """Every history with its probability: link[k][i][j] from sender j to receiver i at step k + 1."""
+    draws = []
+    for k in range(1, steps + 1):
+        if architecture == "ad-hoc":
+            draws += [(k, j, (i,)) for i in range(n) for j in range(n) if i != j]
+        elif architecture == "broadcast":
+            draws += [(k, j, tuple(i for i in range(n) if i != j)) for j in range(n)]
+        else:
+            draws += [(k, (i + 1) % n, (i,)) for i in range(n)]
+    fates = [None, *range(len(delay))]
+    for choice in product(fates, repeat=len(draws)):
+        probability, history = 1.0, [set() for _ in range(steps)]
+        for (k, j, receivers), fate in zip(draws, choice, strict=True):
+            mu = link[k - 1][receivers[0]][j]
+            probability *= 1 - mu if fate is None else mu * delay[fate]
+            if fate is not None and k + fate <= steps:
+                history[k + fate - 1] |= {(j, i, k) for i in receivers}
+        if probability > 0:
+            yield probability, history
+
+
+def expected_by_enumeration(F, Q, sensors, P0, x0, records, architecture, link, delay=(1.0,), shared=False, naive=False):
+    """Expected covariance and state, [step][agent], over every history, nothing merged."""
+    n, steps = len(sensors), len(records)
+    P = np.zeros((steps, n, *P0.shape))
+    x = np.zeros((steps, n, *x0.shape))
+    for probability, history in histories(n, steps, architecture, link, delay):
+        network = FusionNetwork(F, Q, sensors, P0, x0, records, history, shared, naive)
+        for k in range(1, steps + 1):
+            for i in range(n):
+                P[k - 1, i] += probability * network.covariance(i, k)
+                x[k - 1, i] += probability * network.state(i, k)
+    return P, x

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from stochfuse.engines import uncollected
 from stochfuse.errors import NoAnswerError, UsageError
 from stochfuse.estimators import Estimator
 from stochfuse.events import Event, Outcome, Rows, Weights, concerning, fates, outcomes
@@ -33,6 +34,8 @@ MOST_GENERATORS = 6
 """Agents up to which truth tables of the lattice fit 64 bits."""
 MOST_CELLS = 1 << 21
 """Outcomes of one exchange up to which they are listed."""
+LONG = 1000
+"""States from which on the work is long enough to be announced before."""
 CHUNK = 1 << 21
 """Numbers per matrix entry that are worked on at a time."""
 
@@ -67,11 +70,11 @@ class Ending(NamedTuple):
 class Progress:
     """What an enumeration tells while it works; this one says nothing."""
 
-    def expect(self, outcomes: float, graphs: float) -> None:
-        """Called once before long work starts."""
+    def expect(self, outcomes: int, graphs: int) -> None:
+        """Told once, before long work starts: number of outcomes, and of different states expected in the last layer."""
 
     def advance(self, step: int, done: int, total: int) -> None:
-        """Called now and then within a step."""
+        """Told within a step."""
 
 
 @dataclass(frozen=True)
@@ -109,13 +112,11 @@ class Structure(NamedTuple):
     endings : one per step.
     states : number of states carried before each step's exchange.
     outcomes : number of outcomes up to each step.
-    left_out : (rows,) probability of what was left out, or None.
     """
 
     endings: list[Ending]
     states: list[int]
     outcomes: list[int]
-    left_out: np.ndarray | None
 
 
 class TooManyError(UsageError):
@@ -130,7 +131,11 @@ def enumerate_outcomes(estimator: Estimator, request: Request, progress: Progres
     TooManyError
         If more states than `request.most` have to be carried.
     """
-    progress = progress or Progress()
+    with uncollected():
+        return _enumerate(estimator, request, progress or Progress())
+
+
+def _enumerate(estimator: Estimator, request: Request, progress: Progress) -> Structure:
     weights, n, steps = request.weights, request.agents, request.steps
     drawn = [request.events(step) for step in range(1, steps + 1)]
     events_up_to = np.cumsum([len(d) for d in drawn]).tolist()
@@ -138,29 +143,32 @@ def enumerate_outcomes(estimator: Estimator, request: Request, progress: Progres
     for step, d in enumerate(drawn, start=1):
         number.append(number[-1] * len(fates(request.delay, steps - step)) ** len(d))
     two_steps = request.delay == (1.0,) and n <= MOST_GENERATORS and not request.plain
-    layer: dict[Any, Any] = {estimator.start(): weights.one()}
-    sizes, left_out = [1], np.zeros(weights.rows) if isinstance(weights, Rows) and request.prune else None
+    start = estimator.start()
+    layer: dict[Any, Any] = {estimator.exchange(start) if request.plain else start: weights.one()}
+    sizes, announced = [1], False
     endings = [_ending(estimator, layer, drawn[0], 0, events_up_to[0], request)]
-    announced = False
     for step in range(2, steps + 1):
-        degree = events_up_to[step - 2] if not two_steps else events_up_to[step - 3] if step > 2 else 0
+        before, last = drawn[step - 2 : step]
+        degree = events_up_to[step - 2] - two_steps * len(before)
         if two_steps:
-            endings.append(_two_step_ending(estimator, layer, drawn[step - 2], drawn[step - 1], degree, events_up_to[step - 1], request))
+            endings.append(_two_step_ending(estimator, layer, before, last, degree, events_up_to[step - 1], request))
         if step < steps or not two_steps:
             left = steps - step + 1
             expected = _expected(sizes, len(layer) * number[step - 1] // number[step - 2])
-            if not announced and (expected > 1000 or step == steps):
-                progress.expect(float(number[steps]), _extrapolated(sizes, expected, steps - step - two_steps))
+            _check_size(expected, before, len(fates(request.delay, left)), number[steps], step, request)
+            if not announced and expected > LONG:
+                progress.expect(number[steps], _extrapolated(sizes, expected, steps - step - two_steps))
                 announced = True
-            _check_size(len(layer), expected, drawn[step - 2], len(fates(request.delay, left)), number[steps], step, request)
-            layer = _next_layer(estimator, layer, outcomes(drawn[step - 2], n, request.delay, left, weights), step - 1, request, progress)
-            if left_out is not None and len(layer) > request.most:
-                layer, lost = _likeliest(layer, request.most)
-                left_out += lost
+            possible = outcomes(before, n, request.delay, left, weights)
+            layer = _next_layer(estimator, layer, possible, step - 1, request, progress)
+            if request.prune and len(layer) > request.most:
+                layer = _likeliest(layer, request.most)
             sizes.append(len(layer))
         if not two_steps:
-            endings.append(_ending(estimator, layer, drawn[step - 1], degree, events_up_to[step - 1], request))
-    return Structure(endings, sizes, number[1:], left_out)
+            endings.append(_ending(estimator, layer, last, degree, events_up_to[step - 1], request))
+    if not announced:
+        progress.expect(number[steps], sizes[-1])
+    return Structure(endings, sizes, number[1:])
 
 
 def _next_layer(
@@ -169,9 +177,12 @@ def _next_layer(
     times, found = request.weights.times, {}
     total = len(layer)
     for done, (state, weight) in enumerate(layer.items()):
-        exchange = estimator.exchange(state)
+        exchange = state if request.plain else estimator.exchange(state)
         for outcome in possible:
-            after = exchange.after(outcome.heard, outcome.late, merge=not request.plain)
+            if request.plain:
+                after = exchange.onward(outcome.heard, outcome.late)
+            else:
+                after, _ = exchange.after(outcome.heard, outcome.late)
             new = times(weight, outcome.factor)
             known = found.get(after)
             found[after] = new if known is None else known + new
@@ -179,9 +190,9 @@ def _next_layer(
     return found
 
 
-def _likeliest(layer: dict[Any, np.ndarray], most: int) -> tuple[dict[Any, np.ndarray], np.ndarray]:
+def _likeliest(layer: dict[Any, np.ndarray], most: int) -> dict[Any, np.ndarray]:
     order = sorted(layer, key=lambda state: -layer[state].max())
-    return {state: layer[state] for state in order[:most]}, sum(layer[state] for state in order[most:])
+    return {state: layer[state] for state in order[:most]}
 
 
 def _expected(sizes: list[int], candidates: int) -> int:
@@ -190,12 +201,12 @@ def _expected(sizes: list[int], candidates: int) -> int:
     return int(min(candidates, 1.2 * growth * sizes[-1]))
 
 
-def _extrapolated(sizes: list[int], expected: int, further: int) -> float:
-    return expected * (expected / sizes[-1]) ** max(0, further)
+def _extrapolated(sizes: list[int], expected: int, further: int) -> int:
+    return round(expected * (expected / sizes[-1]) ** max(0, further))
 
 
 def _check_size(
-    states: int, expected: int, drawn: list[Event], options: int, number: int, step: int, request: Request
+    expected: int, drawn: list[Event], options: int, number: int, step: int, request: Request
 ) -> None:
     instead = "use --method optimal or --method monte-carlo, fewer steps or fewer agents"
     if options ** len(drawn) > MOST_CELLS >> 4:
@@ -215,7 +226,7 @@ def _ending(
 ) -> Ending:
     """Carry out the last exchange for every state: one view per agent."""
     weights, views = request.weights, []
-    exchanges = [estimator.exchange(state) for state in layer]
+    exchanges = layer if request.plain else [estimator.exchange(state) for state in layer]
     for group, agents in enumerate(request.groups):
         for agent in agents:
             concerned = [e._replace(receivers=(agent,)) for e in concerning(last, [agent])]

@@ -28,8 +28,15 @@ class Exchange(Protocol):
         """Value, in the estimator's ledger, of what an agent claims after hearing some agents (itself included)."""
         ...
 
-    def after(self, heard: Sequence[int], late: Sequence[Late] = (), *, merge: bool = True) -> Hashable:
-        """State before the next exchange; with `merge`, equal states are those that will behave alike from here on."""
+    def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[Hashable, tuple[int, ...]]:
+        """State before the next exchange, equal for all that will behave alike from here on.
+
+        Like agents may change places for that: returned with it is the agent that took each place.
+        """
+        ...
+
+    def onward(self, heard: Sequence[int], late: Sequence[Late] = ()) -> Exchange:
+        """Open the next exchange, nothing merged and nobody moved."""
         ...
 
     def union(self, heard: int) -> int:

@@ -60,11 +60,15 @@ class Pedigrees:
     ----------
     ledger : where values are written.
     values : value of each node.
-    below : pedigree of each node, itself included, as a mask; every ancestor has a smaller number.
+    below : pedigree of each node, itself included, as a mask; every ancestor has a smaller number, and steps never fall.
+    older : pedigrees that have the first nodes in common with these, so that what is known of them holds here.
     """
 
-    def __init__(self, ledger: Ledger, values: Sequence[int], below: Sequence[int]) -> None:
-        self.ledger, self.values, self.below = ledger, values, below
+    def __init__(
+        self, ledger: Ledger, values: Sequence[int], below: Sequence[int], older: Pedigrees | None = None
+    ) -> None:
+        self.ledger, self.values, self.below, self._older = ledger, values, below, older
+        self._new = 1 << len(older.values) if older else 0
         self._known: dict[int, int] = {}
 
     def maximal(self, mask: int) -> Iterator[int]:
@@ -90,15 +94,16 @@ class Pedigrees:
 
     def fuse(self, mask: int) -> int:
         """Value of a pedigree at its latest node's step."""
+        if mask < self._new and self._older:
+            return self._older.fuse(mask)
         known = self._known.get(mask)
         if known is None:
             top = mask.bit_length() - 1
             if mask == self.below[top]:
                 known = self.values[top]
             else:
-                step = max(self.ledger.step[self.values[node]] for node in self.maximal(mask))
                 terms = [(self.fuse(shared), times) for shared, times in self.terms(mask).items()]
-                known = self.ledger.combine(step, terms)
+                known = self.ledger.combine(self.ledger.step[self.values[top]], terms)
             self._known[mask] = known
         return known
 
@@ -136,24 +141,34 @@ class LocalFusionGraph:
 
     def exchange(self, state: State) -> GraphExchange:
         """Open the exchange of the state's step."""
-        return GraphExchange(self, state)
+        values, below = [value for value, _ in state.nodes], [below for _, below in state.nodes]
+        return GraphExchange(self, Pedigrees(self.ledger, values, below), state.agents, state.late)
 
 
 class GraphExchange:
     """One exchange: the agents' nodes are numbered after the older ones."""
 
-    def __init__(self, estimator: LocalFusionGraph, state: State) -> None:
-        self.estimator, self.state = estimator, state
-        older = len(state.nodes)
-        self.current = [agent.known | 1 << older + i for i, agent in enumerate(state.agents)]
+    def __init__(
+        self,
+        estimator: LocalFusionGraph,
+        older: Pedigrees,
+        agents: Sequence[Agent],
+        late: Sequence[tuple[int, int, int]] = (),
+        *,
+        keep: bool = False,
+    ) -> None:
+        self.estimator, self.late = estimator, late
+        first = len(older.values)
+        self.current = [agent.known | 1 << first + i for i, agent in enumerate(agents)]
         self.pedigrees = Pedigrees(
             estimator.ledger,
-            [value for value, _ in state.nodes] + [agent.value for agent in state.agents],
-            [below for _, below in state.nodes] + self.current,
+            [*older.values, *(agent.value for agent in agents)],
+            [*older.below, *self.current],
+            older if keep else None,
         )
         self._unions: dict[int, int] = {}
-        self._due = [0] * len(state.agents)
-        for receiver, left, mask in state.late:
+        self._due = [0] * len(agents)
+        for receiver, left, mask in late:
             if left == 0:
                 self._due[receiver] |= mask
 
@@ -187,25 +202,32 @@ class GraphExchange:
             self._unions[heard] = known
         return known
 
-    def after(self, heard: Sequence[int], late: Sequence[Late] = (), *, merge: bool = True) -> State:
-        """State before the next exchange."""
+    def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[State, tuple[int, ...]]:
+        """State before the next exchange, in the order that like states share, and the agent at each place of it."""
+        return self._merged(*self._next(heard, late))
+
+    def onward(self, heard: Sequence[int], late: Sequence[Late] = ()) -> GraphExchange:
+        """Open the next exchange as it comes, with every node kept."""
+        agents, waiting = self._next(heard, late)
+        under_way = [(receiver, left, mask) for (receiver, left), mask in waiting.items()]
+        return GraphExchange(self.estimator, self.pedigrees, agents, under_way, keep=True)
+
+    def _next(self, heard: Sequence[int], late: Sequence[Late]) -> tuple[list[Agent], dict[tuple[int, int], int]]:
         known = [self.known(i, h) for i, h in enumerate(heard)]
-        fused = [self.pedigrees.fuse(mask) for mask in known]
-        ledger, sources = self.estimator.ledger, self.estimator.sources
-        agents = [Agent(ledger.local(v, s), mask) for v, s, mask in zip(fused, sources, known, strict=True)]
+        local, fuse = self.estimator.ledger.local, self.pedigrees.fuse
+        agents = [Agent(local(fuse(mask), s), mask) for s, mask in zip(self.estimator.sources, known, strict=True)]
         waiting: dict[tuple[int, int], int] = {}
-        if late or self.state.late:
-            under_way = [(r, left - 1, mask) for r, left, mask in self.state.late if left > 0]
+        if late or self.late:
+            under_way = [(r, left - 1, mask) for r, left, mask in self.late if left > 0]
             under_way += [(m.receiver, m.delay - 1, self.current[m.sender]) for m in late]
             for receiver, left, mask in under_way:
                 if mask & ~known[receiver]:  # what is known already will change nothing
                     waiting[receiver, left] = waiting.get((receiver, left), 0) | mask
-        if not merge:
-            nodes = tuple(zip(self.pedigrees.values, self.pedigrees.below, strict=True))
-            return State(nodes, tuple(agents), tuple((r, left, mask) for (r, left), mask in waiting.items()))
-        return self._merged(agents, waiting)
+        return agents, waiting
 
-    def _merged(self, agents: Sequence[Agent], waiting: dict[tuple[int, int], int]) -> State:
+    def _merged(
+        self, agents: Sequence[Agent], waiting: dict[tuple[int, int], int]
+    ) -> tuple[State, tuple[int, ...]]:
         kept = self._reachable([agent.known for agent in agents], list(waiting.values()))
         nodes = [node for node in range(kept.bit_length()) if kept >> node & 1]
         values, below, step = self.pedigrees.values, self.pedigrees.below, self.estimator.ledger.step
@@ -229,7 +251,7 @@ class GraphExchange:
             )
             for i, agent in enumerate(agents)
         ]
-        best: State | None = None
+        best: tuple[State, tuple[int, ...]] | None = None
         for order in best_relabelling(invariants, self.estimator.relabellings):
             place_of = [0] * len(order)
             for place, i in enumerate(order):
@@ -246,8 +268,8 @@ class GraphExchange:
                 tuple(Agent(agents[i].value, _moved(agents[i].known & kept, new)) for i in order),
                 tuple(sorted((place_of[r], left, _moved(m & kept, new)) for (r, left), m in waiting.items())),
             )
-            if best is None or state < best:
-                best = state
+            if best is None or state < best[0]:
+                best = state, order
         if best is None:
             raise ValueError("no relabelling given")
         return best

@@ -78,21 +78,28 @@ class NaiveExchange:
         terms = [(self.union(heard), 1), *((value, 1) for value in self._due[agent])]
         return self.estimator.ledger.combine(self._step, terms)
 
-    def after(self, heard: Sequence[int], late: Sequence[Late] = (), *, merge: bool = True) -> State:
-        """State before the next exchange."""
-        ledger, sources = self.estimator.ledger, self.estimator.sources
-        agents = [ledger.local(self.fused(i, h), sources[i]) for i, h in enumerate(heard)]
-        under_way = [(r, left - 1, value) for r, left, value in self.state.late if left > 0]
-        under_way += [(m.receiver, m.delay - 1, self.state.agents[m.sender]) for m in late]
-        if not merge:
-            return State(tuple(agents), tuple(under_way))
+    def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[State, tuple[int, ...]]:
+        """State before the next exchange, in the order that like states share, and the agent at each place of it."""
+        agents, under_way = self._next(heard, late)
         invariants = [
-            (agents[i], sources[i], sorted((left, value) for r, left, value in under_way if r == i))
+            (agents[i], self.estimator.sources[i], sorted((left, value) for r, left, value in under_way if r == i))
             for i in range(len(agents))
         ]
         states = []
         for order in best_relabelling(invariants, self.estimator.relabellings):
             place = {i: p for p, i in enumerate(order)}
             late_now = tuple(sorted((place[r], left, value) for r, left, value in under_way))
-            states.append(State(tuple(agents[i] for i in order), late_now))
+            states.append((State(tuple(agents[i] for i in order), late_now), order))
         return min(states)
+
+    def onward(self, heard: Sequence[int], late: Sequence[Late] = ()) -> NaiveExchange:
+        """Open the next exchange as it comes."""
+        agents, under_way = self._next(heard, late)
+        return NaiveExchange(self.estimator, State(tuple(agents), tuple(under_way)))
+
+    def _next(self, heard: Sequence[int], late: Sequence[Late]) -> tuple[list[int], list[tuple[int, int, int]]]:
+        ledger, sources = self.estimator.ledger, self.estimator.sources
+        agents = [ledger.local(self.fused(i, h), sources[i]) for i, h in enumerate(heard)]
+        under_way = [(r, left - 1, value) for r, left, value in self.state.late if left > 0]
+        under_way += [(m.receiver, m.delay - 1, self.state.agents[m.sender]) for m in late]
+        return agents, under_way

@@ -1,0 +1,221 @@
+"""Monte Carlo: draw the events, evaluate the estimator, average.  The cross-check; it imports no other engine.
+
+Runs with equal histories are evaluated once: at every step runs are gathered by (state, what arrived), and states that will
+behave alike are taken together while that saves work.  Random numbers are drawn in blocks, each with its own seed, so
+that the sample depends on the seed alone and not on the number of workers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import nullcontext
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from stochfuse.engines import uncollected
+from stochfuse.estimators import Estimator, Exchange, Late
+from stochfuse.events import Event
+from stochfuse.information import Ledger, Sources, evaluate
+from stochfuse.kalman import from_information
+
+BLOCK = 1000
+"""Runs drawn from one seed."""
+MERGE_BELOW = 0.2
+"""Different histories per run up to which states are merged: beyond, nearly every run goes its own way."""
+
+
+class Experiment(NamedTuple):
+    """What is sampled; can be sent to another process.
+
+    Parameters
+    ----------
+    agents : number of agents.
+    events : events of every step.
+    delay : probabilities of 0, 1, 2 … steps of delay.
+    estimator : makes the estimator from a ledger.
+    sources : what start and measurements are worth.
+    runs, seed : size of the sample per row, and its seed.
+    """
+
+    agents: int
+    events: list[list[Event]]
+    delay: tuple[float, ...]
+    estimator: Callable[[Ledger], Estimator]
+    sources: Sources
+    runs: int
+    seed: int
+
+
+class Sample(NamedTuple):
+    """Claimed covariances of every run.
+
+    Parameters
+    ----------
+    values : (values, d, d) different covariances.
+    index : (rows, runs, steps, agents) which of them each agent claims.
+    """
+
+    values: np.ndarray
+    index: np.ndarray
+
+
+def sample(experiment: Experiment, rows: int, *, workers: int = 1, progress: Callable[[int, int], None] | None = None) -> Sample:
+    """Draw `runs` histories for every row.
+
+    Parameters
+    ----------
+    workers : processes that share the work; the sample does not depend on them.
+    progress : called with blocks done and blocks in all.
+    """
+    blocks = [(row, block) for row in range(rows) for block in range(-(-experiment.runs // BLOCK))]
+    share = -(-len(blocks) // max(1, workers))
+    parts = [blocks[first : first + share] for first in range(0, len(blocks), share)]
+    pool: Any = ProcessPoolExecutor(len(parts)) if len(parts) > 1 else nullcontext()
+    with pool as executor:
+        done = _each(executor, experiment, parts)
+        values, index, offset = [], np.empty((rows, experiment.runs, len(experiment.events), experiment.agents), np.int32), 0
+        for part, (P, which) in zip(parts, done, strict=True):
+            first = 0
+            for row, block in part:
+                runs = _runs_of(block, experiment.runs)
+                index[row, block * BLOCK : block * BLOCK + runs] = which[first : first + runs] + offset
+                first += runs
+            values.append(P)
+            offset += len(P)
+            if progress:
+                progress(parts.index(part) + 1, len(parts))
+    return Sample(np.concatenate(values), index)
+
+
+def _each(executor: Executor | None, experiment: Experiment, parts: Sequence[Any]) -> Any:
+    if executor is None:
+        return (run_blocks(experiment, part) for part in parts)
+    return executor.map(run_blocks, [experiment] * len(parts), parts)
+
+
+def run_blocks(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
+    """Covariances and their index (runs, steps, agents) for some (row, block) pairs."""
+    with uncollected():
+        return _run_blocks(experiment, blocks)
+
+
+def _run_blocks(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
+    ledger = Ledger()
+    estimator = experiment.estimator(ledger)
+    drawn = [_draw(experiment, row, block) for row, block in blocks]
+    runs = sum(len(steps[0]) for steps in drawn)
+    claimed = np.empty((runs, len(experiment.events), experiment.agents), np.int32)
+    exchanges, exchange_of = [estimator.exchange(estimator.start())], np.zeros(runs, dtype=np.int64)
+    place_of = np.tile(np.arange(experiment.agents), (runs, 1))
+    for step in range(1, len(experiment.events) + 1):
+        events = experiment.events[step - 1]
+        fates = _moved(np.concatenate([steps[step - 1] for steps in drawn]), events, place_of)
+        different, history_of = _distinct(exchange_of, fates, 1 + len(experiment.delay))
+        histories = _Histories(estimator, events, experiment.agents, exchanges, different)
+        claimed[:, step - 1] = np.take_along_axis(histories.fused()[history_of], place_of, axis=1)
+        if step < len(experiment.events):
+            if len(different) < MERGE_BELOW * runs:
+                exchanges, after, moved = histories.merged()
+                exchange_of, place_of = after[history_of], np.take_along_axis(moved[history_of], place_of, axis=1)
+            else:
+                exchanges, exchange_of = histories.onward(), history_of
+    used, index = np.unique(claimed, return_inverse=True)
+    information = evaluate(ledger, experiment.sources)
+    P = from_information(information._replace(Y=information.Y[used])).P
+    return P, index.reshape(claimed.shape).astype(np.int32)
+
+
+class _Histories:
+    """Different (exchange, fates) pairs of one step.
+
+    Parameters
+    ----------
+    different : (pairs, 1 + events) number of the exchange and fate of each event, in the order of exchanges.
+    """
+
+    def __init__(
+        self,
+        estimator: Estimator,
+        events: Sequence[Event],
+        agents: int,
+        exchanges: Sequence[Exchange],
+        different: np.ndarray,
+    ) -> None:
+        self.estimator, self.agents = estimator, agents
+        self.each = []
+        for exchange, *fates in different.tolist():
+            heard = [1 << i for i in range(agents)]
+            late = []
+            for (sender, receivers, _), fate in zip(events, fates, strict=True):
+                if fate == 1:
+                    for receiver in receivers:
+                        heard[receiver] |= 1 << sender
+                elif fate > 1:
+                    late += [Late(receiver, fate - 1, sender) for receiver in receivers]
+            self.each.append((exchanges[exchange], heard, late))
+
+    def fused(self) -> np.ndarray:
+        """What is claimed at every place, (pairs, agents)."""
+        return np.array([[x.fused(i, h) for i, h in enumerate(heard)] for x, heard, _ in self.each], np.int32)
+
+    def merged(self) -> tuple[list[Exchange], np.ndarray, np.ndarray]:
+        """Next exchanges of the different states, number of each pair's, and where its agents moved, (pairs, agents)."""
+        states: dict[Any, int] = {}
+        after, moved = np.empty(len(self.each), dtype=np.int64), np.empty((len(self.each), self.agents), dtype=np.int64)
+        for pair, (exchange, heard, late) in enumerate(self.each):
+            state, order = exchange.after(heard, late)
+            after[pair] = states.setdefault(state, len(states))
+            moved[pair, order] = range(self.agents)
+        return [self.estimator.exchange(state) for state in states], after, moved
+
+    def onward(self) -> list[Exchange]:
+        """Next exchange of every pair."""
+        return [exchange.onward(heard, late) for exchange, heard, late in self.each]
+
+
+def _moved(fates: np.ndarray, events: Sequence[Event], place_of: np.ndarray) -> np.ndarray:
+    """Fates of the events among places, from those among agents, (runs, events)."""
+    number = {(event.sender, event.receivers): e for e, event in enumerate(events)}
+    different, run_of = np.unique(place_of, axis=0, return_inverse=True)
+    if len(different) == 1 and (different[0] == np.arange(len(different[0]))).all():
+        return fates
+    to = [
+        [number[int(p[e.sender]), tuple(sorted(int(p[r]) for r in e.receivers))] for e in events] for p in different
+    ]
+    out = np.empty_like(fates)
+    np.put_along_axis(out, np.array(to).reshape(len(different), -1)[run_of.ravel()], fates, axis=1)
+    return out
+
+
+def _distinct(exchange_of: np.ndarray, fates: np.ndarray, options: int) -> tuple[np.ndarray, np.ndarray]:
+    """Different (exchange, fates) pairs, in the order of exchanges, and the number of each run's pair."""
+    table = np.concatenate([exchange_of[:, None], fates], axis=1)
+    if (exchange_of.max() + 1.0) * float(options) ** fates.shape[1] < 2**62:
+        code = exchange_of.copy()
+        for fate in fates.T:
+            code = code * options + fate
+        _, first, pair_of = np.unique(code, return_index=True, return_inverse=True)
+        return table[first], pair_of
+    different, pair_of = np.unique(table, axis=0, return_inverse=True)
+    return different, pair_of.ravel()
+
+
+def _runs_of(block: int, runs: int) -> int:
+    return min(BLOCK, runs - block * BLOCK)
+
+
+def _draw(experiment: Experiment, row: int, block: int) -> list[np.ndarray]:
+    """Fates of a block's events per step, (runs, events): 0 lost, 1 + delay otherwise."""
+    generator = np.random.default_rng(np.random.SeedSequence(experiment.seed, spawn_key=(row, block)))
+    runs, delays = _runs_of(block, experiment.runs), np.cumsum(experiment.delay)
+    out = []
+    for events in experiment.events:
+        µ = np.array([event.probability[row] for event in events])
+        arrived = generator.random((runs, len(events))) < µ
+        late = 0
+        if len(delays) > 1:
+            late = np.minimum(np.searchsorted(delays, generator.random((runs, len(events))), side="right"), len(delays) - 1)
+        out.append(np.where(arrived, 1 + late, 0))
+    return out
