@@ -58,9 +58,7 @@ def events(network: Network, rows: LinkRows, step: int) -> list[Event]:
         listeners = {j: tuple(i for i in range(n) if i != j) for j in range(n)}
         found = [Event(j, heard, µ[:, heard[0], place[heard[0], j]]) for j, heard in listeners.items() if heard]
     else:
-        found = [
-            Event(int(j), (i,), µ[:, i, p]) for i in range(n) for p, j in enumerate(senders[i])
-        ]
+        found = [Event(int(j), (i,), µ[:, i, p]) for i in range(n) for p, j in enumerate(senders[i])]
     # with one µ for all links the answer is a polynomial in µ, whatever values of µ are asked for
     return [event for event in found if rows.uniform or (event.probability > 0).any()]
 

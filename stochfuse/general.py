@@ -19,15 +19,15 @@ from typing import Any
 
 import numpy as np
 
+from stochfuse.engines import Progress
 from stochfuse.engines.enumeration import (
-    Progress,
     Request,
     Structure,
     claimed,
     enumerate_outcomes,
     expectation,
 )
-from stochfuse.errors import NoAnswerError, UsageError
+from stochfuse.errors import UsageError
 from stochfuse.estimators.local_fusion_graph import LocalFusionGraph
 from stochfuse.estimators.naive import NaiveFusion
 from stochfuse.events import Rows, bernstein, events, monomials, orbits, relabellings, weights_for
@@ -38,7 +38,6 @@ from stochfuse.network import LinkRows
 from stochfuse.scenario import Scenario
 
 ESTIMATORS = {"local-fusion-graph": LocalFusionGraph, "naive": NaiveFusion}
-MOST_GRAPHS = 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +67,11 @@ class Outcomes:
 
     @cached_property
     def expectations(self) -> list[list[Estimate]]:
-        """Expected estimate per step and group of agents, on the weights' axis (coefficients A_c, or rows)."""
-        return [
-            expectation(ending, self.values, self.weights, len(self.groups)) for ending in self.structure.endings
-        ]
+        """Expected estimate per step and group of agents, on the weights' axis (coefficients A_c, or rows).
+
+        Where outcomes were left out: given that the outcome is one of those that were not.
+        """
+        return [expectation(ending, self.values, self.weights, len(self.groups)) for ending in self.structure.endings]
 
     def coefficients(self, step: int, group: int = 0) -> np.ndarray:
         """A_0 … A_L of E[P(step)](µ) = Σ A_c µ^c (1−µ)^(L−c), shape (L + 1, d, d).
@@ -82,16 +82,23 @@ class Outcomes:
             If links differ, so that there is no single µ.
         """
         if not self.polynomial:
-            raise UsageError("coefficients: expected one link probability for all links and steps, got different ones")
+            raise UsageError(
+                "a polynomial in µ: expected one link probability for all links and steps, and every outcome; got links "
+                "that differ, or outcomes left out"
+            )
         return self.expectations[step - 1][group].P
 
     def covariance(self, link: np.ndarray | None = None) -> np.ndarray:
         """Expected covariance, (rows, steps, groups, d, d), at the scenario's rows or at some link probabilities."""
-        return np.stack([np.stack([self._at(e.P, link) for e in step], axis=1) for step in self.expectations], axis=1)
+        return self._stacked([[self._at(e.P, link) for e in step] for step in self.expectations])
 
     def states(self) -> np.ndarray:
         """Expected state estimates, (rows, steps, groups, d, 1), (48)."""
-        return np.stack([np.stack([self._at(e.x, None) for e in step], axis=1) for step in self.expectations], axis=1)
+        return self._stacked([[self._at(e.x, None) for e in step] for step in self.expectations])
+
+    def _stacked(self, by_step: list[list[np.ndarray]]) -> np.ndarray:
+        stacked = np.stack([np.stack(by_group, axis=1) for by_group in by_step], axis=1)
+        return stacked if self.polynomial else stacked / self._kept()[:, :, None, None, None]
 
     def derivative(self) -> np.ndarray:
         """dE[P]/dµ at the scenario's rows, (rows, steps, groups, d, d)."""
@@ -109,21 +116,67 @@ class Outcomes:
             out.append(np.stack(by_group, axis=1))
         return np.stack(out, axis=1)
 
-    def distribution(self, metric: Metric, step: int, group: int = 0) -> Distribution:
-        """Values of a metric over all outcomes of a step, with their probabilities in every row."""
+    @property
+    def left_out(self) -> np.ndarray:
+        """Probability of the outcomes left out, (rows, steps)."""
+        if self.polynomial:
+            return np.zeros((len(self.rows.link), len(self.structure.endings)))
+        return 1.0 - self._kept()
+
+    def _kept(self) -> np.ndarray:
+        return np.stack([ending.weights.sum(axis=0) for ending in self.structure.endings], axis=1)
+
+    def statistic(self, name: str, metric: Metric, groups: Sequence[int]) -> np.ndarray:
+        """Return a statistic of a metric over the outcomes, (rows, steps).
+
+        Parameters
+        ----------
+        name : "variance", "std", "quantile:P", "at-most:LIMIT" or "derivative" (of the expected metric, in µ).
+        groups : groups of agents, each agent as likely as every other.
+
+        Raises
+        ------
+        UsageError
+            If there is no such statistic, or it cannot be had of this metric.
+        """
+        kind, number = parse_statistic(name)
+        share = [len(self.groups[g]) for g in groups]
+        if kind == "derivative":
+            if not metric.linear:
+                raise UsageError(f"derivative: expected metric trace or var:STATE, got '{metric.name}'")
+            return metric.of(np.average(self.derivative()[:, :, groups], axis=2, weights=share))
+        columns = []
+        for step in range(1, len(self.structure.endings) + 1):
+            spread = self.distribution(metric, step, groups)
+            of = {
+                "variance": spread.variance,
+                "std": lambda spread=spread: np.sqrt(spread.variance()),
+                "quantile": lambda spread=spread: spread.quantile(number),
+                "at-most": lambda spread=spread: spread.at_most(number),
+            }
+            columns.append(of[kind]())
+        return np.stack(columns, axis=1)
+
+    def distribution(self, metric: Metric, step: int, groups: Sequence[int] = (0,)) -> Distribution:
+        """Values of a metric over all outcomes of a step, with their probabilities in every row.
+
+        Several groups of agents: of an agent picked at random.
+        """
         ending = self.structure.endings[step - 1]
+        agents = sum(len(self.groups[g]) for g in groups)
         values, weights = [], []
         for view, states, estimate in claimed(ending, self.values):
-            share = view.shares[group]
-            if share is None:
+            shares = [(view.shares[g], len(self.groups[g]) / agents) for g in groups if view.shares[g] is not None]
+            if not shares:
                 continue
             value = metric.of(estimate.P)
             before = self._probability(ending.weights[states])
             cells = np.repeat(self._probability(view.factors), np.diff([*view.starts, value.shape[1]]), axis=1)
+            last = sum(part * self._probability(share[None]) for share, part in shares)
             values.append(value.ravel())
-            last = self._probability(share[None])
             weights.append((before[:, :, None] * (cells * last)[:, None, :]).reshape(len(before), -1))
-        return Distribution.merged(np.concatenate(values), np.concatenate(weights, axis=1))
+        found = Distribution.merged(np.concatenate(values), np.concatenate(weights, axis=1))
+        return Distribution(found.values, found.probability / found.probability.sum(axis=1, keepdims=True))
 
     def _probability(self, table: np.ndarray) -> np.ndarray:
         """Probabilities (rows, entries) of entries given on the weights' axis."""
@@ -182,7 +235,7 @@ def outcomes(
     estimator: str = "local-fusion-graph",
     *,
     records: np.ndarray | None = None,
-    max_graphs: int = MOST_GRAPHS,
+    max_graphs: int = 100_000,
     prune: bool = False,
     plain: bool = False,
     progress: Progress | None = None,
@@ -253,4 +306,24 @@ def sources_of(scenario: Scenario, records: np.ndarray | None = None) -> Sources
     return Sources(scenario.model, sensors, [start] * len(sensors), columns)
 
 
-__all__ = ["Distribution", "NoAnswerError", "Outcomes", "Sequence", "outcomes", "sources_of"]
+def parse_statistic(name: str) -> tuple[str, float]:
+    """Return kind and number of a statistic's name.
+
+    Raises
+    ------
+    UsageError
+        If there is no such statistic.
+    """
+    kind, colon, text = name.partition(":")
+    if kind in ("variance", "std", "derivative") and not colon:
+        return kind, 0.0
+    if kind in ("quantile", "at-most"):
+        try:
+            number = float(text)
+        except ValueError:
+            number = float("nan")
+        if np.isfinite(number) and (kind == "at-most" or 0 <= number <= 1):
+            return kind, number
+    raise UsageError(
+        f"statistic: expected mean, variance, std, quantile:P with P from 0 to 1, at-most:LIMIT or derivative, got '{name}'"
+    )

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from stochfuse.algebra import NUMPY, Algebra
-from stochfuse.errors import NoAnswerError
+from stochfuse.errors import NoAnswerError, UsageError
 from stochfuse.kalman import Information, from_information, predict, to_information, update_information
 from stochfuse.model import Model, Sensor, at_step
 
@@ -117,13 +117,9 @@ class Sources:
     def measured(self, step: int, source: int) -> Information:
         """Information of one measurement, HᵀR⁻¹H and HᵀR⁻¹z."""
         sensor = self.sensors[source]
-        nothing = Information(
-            None if self.records is None else 0 * self.starts[source].y, 0 * self.starts[source].Y
-        )
+        nothing = Information(None if self.records is None else 0 * self.starts[source].y, 0 * self.starts[source].Y)
         z = None if self.records is None else self.records[step - 1][source]
-        return update_information(
-            nothing, at_step(sensor.H, step), at_step(sensor.R, step), z, algebra=self.algebra
-        )
+        return update_information(nothing, at_step(sensor.H, step), at_step(sensor.R, step), z, algebra=self.algebra)
 
     def forward(self, information: Information, step: int) -> Information:
         """Time update of an information pair (or a stack) from step − 1 to the step."""
@@ -144,6 +140,8 @@ def evaluate(ledger: Ledger, sources: Sources) -> Information:
     ------
     NoAnswerError
         If some value is no positive-definite information: nothing can be inferred from it.
+    UsageError
+        If a predicted covariance has no inverse.
     """
     d = sources.model.dimension
     states = sources.records is not None
@@ -157,8 +155,14 @@ def evaluate(ledger: Ledger, sources: Sources) -> Information:
         brought = np.flatnonzero(prior & (atom_step == step))
         if len(brought):
             before = _pair(values[of[brought]], d, states)
-            _check_definite(before.Y, step - 1)
-            atoms[brought] = _packed(sources.forward(before, step))
+            check_definite(before.Y, step - 1)
+            try:
+                atoms[brought] = _packed(sources.forward(before, step))
+            except np.linalg.LinAlgError:
+                raise UsageError(
+                    f"the covariance predicted for step {step} is singular, and the common information is its inverse: "
+                    "expected an invertible model.F, or a model.Q that fills what it leaves out"
+                ) from None
         for atom in np.flatnonzero(~prior & (atom_step == step)):
             given = sources.starts[of[atom]] if kinds[atom] == START else sources.measured(step, of[atom])
             atoms[atom] = _packed(given)
@@ -167,8 +171,7 @@ def evaluate(ledger: Ledger, sources: Sources) -> Information:
         which, times = np.array([pair for sum_ in terms for pair in sum_], dtype=int).T
         first = np.cumsum([0] + [len(sum_) for sum_ in terms[:-1]])
         values[here] = np.add.reduceat(times[:, None, None] * atoms[which], first, axis=0)
-    result = _pair(values, d, states)
-    return result
+    return _pair(values, d, states)
 
 
 def evaluate_exactly(ledger: Ledger, sources: Sources) -> list[Information]:
@@ -201,13 +204,14 @@ def _pair(packed: np.ndarray, d: int, states: bool) -> Information:
     return Information(packed[..., d:] if states else None, packed[..., :d])
 
 
-def _check_definite(Y: np.ndarray, step: int) -> None:
+def check_definite(Y: np.ndarray, step: int) -> None:
+    """Raise NoAnswerError if an information matrix of a step's stack is not positive definite."""
     try:
         fine = bool((Y > 0).all()) if Y.shape[-1] == 1 else np.isfinite(np.linalg.cholesky(Y)).all()
     except np.linalg.LinAlgError:
         fine = False
     if not fine:
         raise NoAnswerError(
-            f"at step {step} the information of some outcome is not positive definite: what is taken for common exceeds "
-            "what is known, and no covariance follows"
+            f"at step {step} the information claimed in some outcome is not positive definite: what is taken for common "
+            "exceeds what is known, and no covariance follows"
         )

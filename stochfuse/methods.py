@@ -2,17 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from stochfuse import simplified
 from stochfuse.errors import UsageError
+from stochfuse.network import LinkRows
 from stochfuse.prediction import Prediction
 from stochfuse.scenario import Scenario, link_rows
 
-METHODS = ("simplified",)
+METHODS = ("simplified", "general", "naive", "monte-carlo")
 QUANTITIES = ("claimed",)
+ESTIMATORS = ("local-fusion-graph", "naive")
+MOST_GRAPHS = 100_000
+RUNS, SEED = 1000, 1
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a method goes about its work.
+
+    Parameters
+    ----------
+    estimator : what the agents do with what arrives: "local-fusion-graph" or "naive" (general and monte-carlo).
+    max_graphs : general, naive: different graphs that may be carried from step to step.
+    prune : general, naive: leave the least likely graphs out where there are more, instead of giving up.
+    runs, seed : monte-carlo: independent runs per link probability, and the seed.
+    workers : monte-carlo: processes; default: one for small samples, else one per processor.
+    progress : told how far long work is, see `stochfuse.engines.enumeration.Progress`.
+    """
+
+    estimator: str = "local-fusion-graph"
+    max_graphs: int = MOST_GRAPHS
+    prune: bool = False
+    runs: int = RUNS
+    seed: int = SEED
+    workers: int | None = None
+    progress: Any = None
 
 
 def predict(
@@ -22,6 +51,7 @@ def predict(
     quantity: str = "claimed",
     *,
     steady: bool = False,
+    **settings: Any,
 ) -> Prediction:
     """Predict the expected fused covariance against link probability.
 
@@ -30,9 +60,12 @@ def predict(
     scenario : from `load_scenario`.
     link : link probabilities, one row of the result each; an array of shape (rows, agents, agents) gives a matrix µ_ij
         (receiver, sender) per row.  Default: the scenario's cases, else its link, else 0, 0.25, 0.5, 0.75 and 1.
-    method : "simplified": thesis (50)–(54), approximate (mean field).
+    method : "simplified": thesis (50)–(54), approximate (mean field); "general": thesis (44)–(49), exact, every outcome with
+        its common information found by the Local Fusion Graph; "naive": the same with naive fusion (42)/(43);
+        "monte-carlo": sampled.
     quantity : "claimed": the covariance that the fusion rule itself reports.
-    steady : also solve for the steady state.
+    steady : also solve for the steady state (simplified).
+    **settings : see `Settings`.
 
     Returns
     -------
@@ -45,23 +78,31 @@ def predict(
     NoAnswerError
         If a steady state is asked for and there is none.
     """
-    _choose("method", method, METHODS)
-    _choose("quantity", quantity, QUANTITIES)
+    choose("method", method, METHODS)
+    choose("quantity", quantity, QUANTITIES)
+    unknown = set(settings) - set(Settings.__dataclass_fields__)
+    if unknown:
+        raise TypeError(f"predict() got an unexpected keyword argument '{sorted(unknown)[0]}'")
+    how = Settings(**settings)
+    choose("estimator", how.estimator, ESTIMATORS)
+    if steady and method != "simplified":
+        raise UsageError(f"steady: expected method simplified, got {method}")
     rows = link_rows(scenario, link)
-    result = simplified.covariances(scenario, rows)
+    make: dict[str, Callable[[], dict[str, Any]]] = {
+        "simplified": lambda: _simplified(scenario, rows),
+        "general": lambda: _enumerated(scenario, rows, how, how.estimator),
+        "naive": lambda: _enumerated(scenario, rows, how, "naive"),
+        "monte-carlo": lambda: _sampled(scenario, rows, how),
+    }
     prediction = Prediction(
         scenario=scenario,
         method=method,
         quantity=quantity,
         stage="posterior",
-        nature="approximate",
         link=rows.means(scenario.network),
         cases=rows.names,
         steps=np.arange(1, scenario.network.steps + 1),
-        by_group=result.P,
-        group_of=result.group_of,
-        forms=result.forms,
-        notes=tuple(simplified.departures(scenario, rows)),
+        **make[method](),
     )
     if not steady:
         return prediction
@@ -71,6 +112,68 @@ def predict(
     return prediction.with_steady(fixed.P, fixed.bound)
 
 
-def _choose(name: str, value: str, choices: Sequence[str]) -> None:
+def _simplified(scenario: Scenario, rows: LinkRows) -> dict[str, Any]:
+    result = simplified.covariances(scenario, rows)
+    return {
+        "nature": "approximate",
+        "by_group": result.P,
+        "group_of": result.group_of,
+        "forms": result.forms,
+        "notes": tuple(simplified.departures(scenario, rows)),
+    }
+
+
+def _enumerated(scenario: Scenario, rows: LinkRows, how: Settings, estimator: str) -> dict[str, Any]:
+    from stochfuse.general import outcomes
+
+    if how.max_graphs < 1:
+        raise UsageError(f"max_graphs: expected a whole number of at least 1, got {how.max_graphs}")
+    found = outcomes(scenario, rows, estimator, max_graphs=how.max_graphs, prune=how.prune, progress=how.progress)
+    left_out = float(found.left_out.max())
+    notes = []
+    if left_out > 1e-12:
+        notes.append(
+            f"outcomes of probability up to {left_out:.2g} are left out; what is shown holds given one of the others"
+        )
+    return {
+        "nature": "exact" if left_out <= 1e-12 else "approximate",
+        "by_group": found.covariance(),
+        "group_of": _group_of(found.groups),
+        "estimator": estimator,
+        "notes": tuple(notes),
+        "outcomes": found,
+        "meta": {
+            "outcomes": found.structure.outcomes[-1],
+            "graphs": found.structure.states,
+            "left_out": found.left_out.tolist(),
+        },
+    }
+
+
+def _sampled(scenario: Scenario, rows: LinkRows, how: Settings) -> dict[str, Any]:
+    from stochfuse.sampled import sampled
+
+    found = sampled(
+        scenario, rows, how.estimator, runs=how.runs, seed=how.seed, workers=how.workers, progress=how.progress
+    )
+    return {
+        "nature": "sampled",
+        "by_group": found.covariance(),
+        "group_of": _group_of(found.groups),
+        "estimator": how.estimator,
+        "sampled": found,
+        "meta": {"runs": how.runs, "seed": how.seed},
+    }
+
+
+def _group_of(groups: Sequence[tuple[int, ...]]) -> np.ndarray:
+    index = np.zeros(sum(map(len, groups)), dtype=int)
+    for group, agents in enumerate(groups):
+        index[list(agents)] = group
+    return index
+
+
+def choose(name: str, value: str, choices: Sequence[str]) -> None:
+    """Raise UsageError if a value is not one of the choices."""
     if value not in choices:
         raise UsageError(f"{name}: expected one of {', '.join(choices)}, got '{value}'")

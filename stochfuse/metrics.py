@@ -28,6 +28,7 @@ class Metric:
     unit : its unit; empty if the states have none or different ones.
     of : the function, from (..., d, d) to (...).
     mixed : whether it adds up quantities of different units.
+    linear : whether the metric of a sum is the sum of the metrics.
     """
 
     name: str
@@ -35,6 +36,7 @@ class Metric:
     unit: str
     of: Callable[[np.ndarray], np.ndarray]
     mixed: bool = False
+    linear: bool = False
 
 
 def metric(name: str, model: Model) -> Metric:
@@ -50,13 +52,13 @@ def metric(name: str, model: Model) -> Metric:
     if kind in ("trace", "det", "max-eig") and not rest:
         mixed = len(set(model.units)) > 1
         unit = model.units[0]
-        square = _power(unit, 2)
+        square = power(unit, 2)
         if kind == "trace":
             label = f"trace over {everything}" if model.dimension > 1 else f"variance of {everything}"
-            return Metric(name, label, "" if mixed else square, _trace, mixed)
+            return Metric(name, label, "" if mixed else square, _trace, mixed, linear=True)
         if kind == "max-eig":
             return Metric(name, f"largest eigenvalue over {everything}", "" if mixed else square, _largest, mixed)
-        units = " ".join(filter(None, (_power(u, 2) for u in model.units)))
+        units = " ".join(filter(None, (power(u, 2) for u in model.units)))
         return Metric(name, f"determinant over {everything}", units, np.linalg.det)
     if kind in ("var", "std", "rms") and rest:
         chosen = [_index(name, state.strip(), model) for state in rest.split(",")]
@@ -68,7 +70,8 @@ def metric(name: str, model: Model) -> Metric:
         unit, mixed = (units.pop(), False) if len(units) == 1 else ("", True)
         names = ", ".join(model.states[i] for i in chosen)
         if kind == "var":
-            return Metric(name, f"variance of {names}", _power(unit, 2), lambda P: P[..., chosen[0], chosen[0]])
+            variance = lambda P: P[..., chosen[0], chosen[0]]  # noqa: E731
+            return Metric(name, f"variance of {names}", power(unit, 2), variance, linear=True)
         if kind == "std":
             return Metric(name, f"standard deviation of {names}", unit, lambda P: np.sqrt(P[..., chosen[0], chosen[0]]))
         root = f"RMS of {names} (root of the summed variances)" if len(chosen) > 1 else f"RMS of {names}"
@@ -90,7 +93,8 @@ def _largest(P: np.ndarray) -> np.ndarray:
     return np.linalg.eigvalsh(P)[..., -1]
 
 
-def _power(unit: str, exponent: int) -> str:
+def power(unit: str, exponent: int) -> str:
+    """Return a unit's power: m², (m/s)²."""
     if not unit:
         return ""
     superscript = "²" if exponent == 2 else f"^{exponent}"

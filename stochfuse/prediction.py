@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -10,15 +12,19 @@ from stochfuse.errors import UsageError
 from stochfuse.metrics import Metric, metric
 from stochfuse.scenario import Scenario
 
+if TYPE_CHECKING:
+    from stochfuse.general import Outcomes
+    from stochfuse.sampled import Sampled
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class Prediction:
     """Expected covariance against link probability and step.
 
     Parameters
     ----------
     scenario : what was given.
-    method : how it was computed: "simplified".
+    method : how it was computed: "simplified", "general", "naive" or "monte-carlo".
     quantity : which covariance: "claimed".
     stage : "posterior": after the step's measurement and fusion.
     nature : "exact", "approximate", "bound" or "sampled".
@@ -29,6 +35,10 @@ class Prediction:
     group_of : (agents,) index into the groups.
     forms : numeric forms used.
     notes : what the reader should know, one sentence each.
+    estimator : what the agents do with what arrives.
+    outcomes : all outcomes, where they were enumerated: for distributions and polynomials.
+    sampled : the sample, where it was drawn: for standard errors.
+    meta : further facts for programs.
     steady : (links, groups, d, d) steady-state covariance if it was asked for.
     steady_bound : (links, groups) proved relative error bound of `steady`.
     """
@@ -45,6 +55,10 @@ class Prediction:
     group_of: np.ndarray
     forms: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    estimator: str = "broadcast-prior"
+    outcomes: Outcomes | None = field(default=None, repr=False)
+    sampled: Sampled | None = field(default=None, repr=False)
+    meta: Mapping[str, Any] = field(default_factory=dict)
     steady: np.ndarray | None = None
     steady_bound: np.ndarray | None = field(default=None, repr=False)
 
@@ -60,7 +74,7 @@ class Prediction:
 
     def of_agent(self, agent: int | str = "mean") -> np.ndarray:
         """Covariance of one agent (numbered from 1) or averaged over all, shape (links, steps, d, d)."""
-        return _select(self.by_group, self.group_of, agent)
+        return self._select(self.by_group, agent)
 
     def values(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray:
         """Return a metric of the covariance, shape (links, steps).
@@ -72,6 +86,61 @@ class Prediction:
             or smallest value among the agents, for each link and step).
         """
         return self._reduce(self.by_group, of, agent)
+
+    def statistic(self, name: str, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray:
+        """Return a statistic of a metric over the outcomes, shape (links, steps).
+
+        Parameters
+        ----------
+        name : "mean", "variance", "std", "quantile:P", "at-most:LIMIT" (the probability that the metric is at most that)
+            or "derivative" (of the expected metric in the link probability).
+        of : the metric; except for "mean", of the covariance in each outcome.
+        agent : as in `values`; "mean" is an agent picked at random.
+
+        Raises
+        ------
+        UsageError
+            If the outcomes were not enumerated, or there is no such statistic of the metric.
+        """
+        if name == "mean":
+            return self.values(of, agent)
+        if self.outcomes is None:
+            raise UsageError(f"statistic '{name}': expected method general or naive, got {self.method}")
+        m = metric(of, self.scenario.model) if isinstance(of, str) else of
+        everyone = list(range(self.by_group.shape[2]))
+        if agent in ("worst", "best"):
+            each = np.stack([self.outcomes.statistic(name, m, [g]) for g in everyone])
+            return each.max(axis=0) if agent == "worst" else each.min(axis=0)
+        return self.outcomes.statistic(name, m, everyone if agent == "mean" else [self._group(agent)])
+
+    def polynomials(self, of: Metric, agent: int | str = "mean") -> list[np.ndarray] | None:
+        """Return A_0 … A_L per step of a linear metric's polynomial Σ A_c µ^c (1−µ)^(L−c); None if there is none."""
+        if self.outcomes is None or not self.outcomes.polynomial or agent in ("worst", "best"):
+            return None
+        groups = range(self.by_group.shape[2]) if agent == "mean" else [self._group(agent)]
+        share = [(self.group_of == g).sum() for g in groups]
+        return [
+            of.of(np.average([self.outcomes.coefficients(int(k), g) for g in groups], axis=0, weights=share))
+            for k in self.steps
+        ]
+
+    def standard_error(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray | None:
+        """Return the standard error of `values`, shape (links, steps), or None if nothing was sampled."""
+        if self.sampled is None:
+            return None
+        m = metric(of, self.scenario.model) if isinstance(of, str) else of
+        groups = self.sampled.groups
+        if agent in ("worst", "best"):
+            each = np.stack([self.sampled.standard_error(m, group) for group in groups])
+            P = m.of(self.by_group)
+            chosen = P.argmax(axis=-1) if agent == "worst" else P.argmin(axis=-1)
+            return np.take_along_axis(each, chosen[None], axis=0)[0]
+        return self.sampled.standard_error(m, sum(groups, ()) if agent == "mean" else groups[self._group(agent)])
+
+    def _group(self, agent: int | str) -> int:
+        if isinstance(agent, int | np.integer) and 1 <= agent <= len(self.group_of):
+            return int(self.group_of[agent - 1])
+        raise UsageError(f"agent: expected mean, worst, best or a number from 1 to {len(self.group_of)}, got '{agent}'")
 
     def steady_values(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray | None:
         """Return a metric of the steady state, shape (links,), or None if none was computed."""
@@ -94,13 +163,10 @@ class Prediction:
             if agent in ("worst", "best"):
                 each = m.of(P)
                 return each.max(axis=-1) if agent == "worst" else each.min(axis=-1)
-            return m.of(_select(P, self.group_of, agent))
+            return m.of(self._select(P, agent))
 
-
-def _select(P: np.ndarray, group_of: np.ndarray, agent: int | str) -> np.ndarray:
-    if agent == "mean":
-        share = np.bincount(group_of, minlength=P.shape[-3]) / len(group_of)
+    def _select(self, P: np.ndarray, agent: int | str) -> np.ndarray:
+        if agent != "mean":
+            return P[..., self._group(agent), :, :]
+        share = np.bincount(self.group_of, minlength=P.shape[-3]) / len(self.group_of)
         return P[..., 0, :, :] if P.shape[-3] == 1 else np.tensordot(P, share, axes=(P.ndim - 3, 0))
-    if isinstance(agent, int | np.integer) and 1 <= agent <= len(group_of):
-        return P[..., group_of[agent - 1], :, :]
-    raise UsageError(f"agent: expected mean, worst, best or a number from 1 to {len(group_of)}, got '{agent}'")

@@ -243,7 +243,9 @@ def histories(n, steps, architecture, link, delay=(1.0,)):
             yield probability, history
 
 
-def expected_by_enumeration(F, Q, sensors, P0, x0, records, architecture, link, delay=(1.0,), shared=False, naive=False):
+def expected_by_enumeration(
+    F, Q, sensors, P0, x0, records, architecture, link, delay=(1.0,), shared=False, naive=False
+):
     """Expected covariance and state, [step][agent], over every history, nothing merged."""
     n, steps = len(sensors), len(records)
     P = np.zeros((steps, n, *P0.shape))

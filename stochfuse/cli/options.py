@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from stochfuse.scenario import Scenario
 
 MOST_LINKS = 1_000_000
 
@@ -19,6 +22,13 @@ class Format(StrEnum):
     json = "json"
     markdown = "markdown"
     latex = "latex"
+
+
+class Estimator(StrEnum):
+    """What the agents do with what arrives."""
+
+    local_fusion_graph = "local-fusion-graph"
+    naive = "naive"
 
 
 class Architecture(StrEnum):
@@ -51,6 +61,86 @@ FormatOption = Annotated[
     Format | None,
     typer.Option("--format", "-f", help="Output format; default: table, or what the output file's name says."),
 ]
+
+
+AgentsOption = Annotated[int | None, typer.Option(min=1, help="Number of agents.")]
+StepsOption = Annotated[int | None, typer.Option(min=1, help="Number of time steps.")]
+LinkOption = Annotated[
+    str | None,
+    typer.Option(metavar="SPEC", help="Link probabilities, for all links alike: 0.5, 0.2,0.5 or 0:1:0.25 (both ends)."),
+]
+QOption = Annotated[float | None, typer.Option(help="Process noise variance Q (times the identity).")]
+ROption = Annotated[
+    float | None, typer.Option(help="Measurement noise variance R (times the identity), of agents without their own.")
+]
+P0Option = Annotated[float | None, typer.Option(help="Variance of the initial estimates P(k0) (times the identity).")]
+ArchitectureOption = Annotated[Architecture | None, typer.Option(help="Who may hear whom.")]
+MetricOption = Annotated[
+    str | None,
+    typer.Option(
+        help="trace, det, max-eig, var:STATE, std:STATE or rms:STATE,STATE; default: the scenario's, else trace."
+    ),
+]
+AgentOption = Annotated[
+    str,
+    typer.Option(metavar="N", help="Whose covariance where agents differ: mean, worst, best or an agent's number."),
+]
+EstimatorOption = Annotated[Estimator, typer.Option(help="general, monte-carlo: what the agents do with what arrives.")]
+MaxGraphsOption = Annotated[
+    int, typer.Option(min=1, help="general, naive: different graphs that may be carried from step to step.")
+]
+PruneOption = Annotated[
+    bool,
+    typer.Option(
+        "--prune", help="general, naive: beyond --max-graphs leave the least likely out, and say how likely they were."
+    ),
+]
+RunsOption = Annotated[int, typer.Option(min=2, help="monte-carlo: independent runs per link probability.")]
+SeedOption = Annotated[int, typer.Option(min=0, help="monte-carlo: seed of the random numbers.")]
+WorkersOption = Annotated[
+    int | None,
+    typer.Option(min=1, help="monte-carlo: processes; default: one for small samples, else one per processor."),
+]
+DigitsOption = Annotated[int, typer.Option(min=1, max=17, help="Significant digits in tables.")]
+PlotOption = Annotated[Path | None, typer.Option(metavar="FILE", help="Also draw a figure: .png, .svg or .pdf.")]
+
+
+def load(
+    scenario: str,
+    agents: int | None,
+    steps: int | None,
+    architecture: Architecture | None,
+    q: float | None,
+    r: float | None,
+    p0: float | None,
+    link: str | None,
+) -> tuple[Scenario, list[float] | None]:
+    """Return the scenario with the options' values in it, and the link probabilities asked for."""
+    from stochfuse.scenario import load_scenario
+
+    links = None if link is None else parse_link(link)
+    given = load_scenario(
+        scenario,
+        agents=agents,
+        steps=steps,
+        architecture=architecture.value if architecture else None,
+        q=q,
+        r=r,
+        p0=p0,
+        uniform_link=links is not None,
+    )
+    return given, links
+
+
+def check_files(output: Path | None, plot: Path | None) -> None:
+    """Raise UsageError early if a file can never be written, or if two are one."""
+    from stochfuse.errors import UsageError
+    from stochfuse.report.export import PLOT_SUFFIXES, check_writable
+
+    check_writable(output)
+    check_writable(plot, PLOT_SUFFIXES)
+    if plot is not None and output is not None and plot.resolve() == output.resolve():
+        raise UsageError(f"--output and --plot: expected different files, got {output} for both")
 
 
 def parse_link(text: str) -> list[float]:

@@ -2,20 +2,39 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from stochfuse.cli.options import (
-    Architecture,
+    AgentOption,
+    AgentsOption,
+    ArchitectureOption,
+    DigitsOption,
+    Estimator,
+    EstimatorOption,
     Format,
     FormatOption,
+    LinkOption,
+    MaxGraphsOption,
+    MetricOption,
     OutputOption,
+    P0Option,
+    PlotOption,
+    PruneOption,
+    QOption,
+    ROption,
+    RunsOption,
     ScenarioArgument,
+    SeedOption,
+    StepsOption,
+    WorkersOption,
+    check_files,
     chosen_format,
-    parse_link,
+    load,
 )
 
 if TYPE_CHECKING:
@@ -26,6 +45,9 @@ class Method(StrEnum):
     """Methods of prediction."""
 
     simplified = "simplified"
+    general = "general"
+    naive = "naive"
+    monte_carlo = "monte-carlo"
 
 
 class Quantity(StrEnum):
@@ -36,43 +58,38 @@ class Quantity(StrEnum):
 
 def predict(
     scenario: ScenarioArgument = "thesis-transient",
-    agents: Annotated[int | None, typer.Option(min=1, help="Number of agents.")] = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Number of time steps.")] = None,
-    link: Annotated[
-        str | None,
-        typer.Option(
-            metavar="SPEC", help="Link probabilities, for all links alike: 0.5, 0.2,0.5 or 0:1:0.25 (both ends)."
-        ),
-    ] = None,
-    q: Annotated[float | None, typer.Option(help="Process noise variance Q (times the identity).")] = None,
-    r: Annotated[
-        float | None,
-        typer.Option(help="Measurement noise variance R (times the identity), of agents without their own."),
-    ] = None,
-    p0: Annotated[
-        float | None, typer.Option(help="Variance of the initial estimates P(k0) (times the identity).")
-    ] = None,
-    architecture: Annotated[Architecture | None, typer.Option(help="Who may hear whom.")] = None,
+    agents: AgentsOption = None,
+    steps: StepsOption = None,
+    link: LinkOption = None,
+    q: QOption = None,
+    r: ROption = None,
+    p0: P0Option = None,
+    architecture: ArchitectureOption = None,
     method: Annotated[Method, typer.Option(help="How to average over which messages arrive.")] = Method.simplified,
+    estimator: EstimatorOption = Estimator.local_fusion_graph,
     quantity: Annotated[Quantity, typer.Option(help="Which covariance.")] = Quantity.claimed,
-    metric: Annotated[
-        str | None,
-        typer.Option(
-            help="trace, det, max-eig, var:STATE, std:STATE or rms:STATE,STATE; default: the scenario's, else trace."
-        ),
-    ] = None,
-    agent: Annotated[
+    metric: MetricOption = None,
+    statistic: Annotated[
         str,
-        typer.Option(metavar="N", help="Whose covariance where agents differ: mean, worst, best or an agent's number."),
+        typer.Option(
+            metavar="NAME",
+            help="mean; or over the outcomes (general, naive): variance, std, quantile:P, at-most:LIMIT, derivative.",
+        ),
     ] = "mean",
+    agent: AgentOption = "mean",
     normalise: Annotated[bool, typer.Option("--normalise", help="Relative to link probability 0.")] = False,
     steady: Annotated[
-        bool, typer.Option("--steady", help="Add the steady state, P = g(P), with a proved bound.")
+        bool, typer.Option("--steady", help="Add the steady state, P = g(P), with a proved bound (simplified).")
     ] = False,
-    digits: Annotated[int, typer.Option(min=1, max=17, help="Significant digits in tables.")] = 5,
+    max_graphs: MaxGraphsOption = 100_000,
+    prune: PruneOption = False,
+    runs: RunsOption = 1000,
+    seed: SeedOption = 1,
+    workers: WorkersOption = None,
+    digits: DigitsOption = 5,
     format: FormatOption = None,
     output: OutputOption = None,
-    plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Also draw a figure: .png, .svg or .pdf.")] = None,
+    plot: PlotOption = None,
 ) -> None:
     """Tabulate the expected fused covariance against link probability.
 
@@ -81,35 +98,45 @@ def predict(
     from stochfuse.errors import UsageError
     from stochfuse.methods import predict as run
     from stochfuse.metrics import metric as metric_of
-    from stochfuse.report.export import PLOT_SUFFIXES, check_writable
     from stochfuse.report.predictions import View
-    from stochfuse.scenario import load_scenario
 
-    check_writable(output)
-    check_writable(plot, PLOT_SUFFIXES)
-    if plot is not None and output is not None and plot.resolve() == output.resolve():
-        raise UsageError(f"--output and --plot: expected different files, got {output} for both")
-    links = None if link is None else parse_link(link)
-    given = load_scenario(
-        scenario,
-        agents=agents,
-        steps=steps,
-        architecture=architecture.value if architecture else None,
-        q=q,
-        r=r,
-        p0=p0,
-        uniform_link=links is not None,
-    )
+    check_files(output, plot)
+    given, links = load(scenario, agents, steps, architecture, q, r, p0, link)
     chosen = metric_of(metric or given.metric or "trace", given.model)
-    prediction = run(given, links, method.value, quantity.value, steady=steady)
-    baseline = run(given, [0.0], method.value, quantity.value, steady=steady) if normalise else None
-    view = View(prediction, chosen, int(agent) if agent.isdigit() else agent, baseline, digits)
+    if statistic != "mean":
+        if method not in (Method.general, Method.naive):
+            raise UsageError(f"--statistic {statistic}: expected --method general or naive, got {method.value}")
+        if normalise:
+            raise UsageError("--normalise: expected --statistic mean")
+    settings: dict[str, Any] = {"steady": steady}
+    if method is not Method.simplified:
+        settings |= {
+            "estimator": estimator.value,
+            "max_graphs": max_graphs,
+            "prune": prune,
+            "runs": runs,
+            "seed": seed,
+            "workers": workers,
+        }
+    with _progress(method) as settings["progress"]:
+        prediction = run(given, links, method.value, quantity.value, **settings)
+        baseline = run(given, [0.0], method.value, quantity.value, **settings) if normalise else None
+    view = View(prediction, chosen, int(agent) if agent.isdigit() else agent, baseline, digits, statistic)
+    view.values()  # a request that cannot be met should say so before notes and figures
     _warn(view)
     if plot is not None:
         from stochfuse.report.plot import plot_prediction
 
         plot_prediction(view, plot)
     _write(view, chosen_format(format, output), output)
+
+
+def _progress(method: Method) -> AbstractContextManager[Any]:
+    if method is Method.simplified:
+        return nullcontext()
+    from stochfuse.cli.progress import shown
+
+    return shown()
 
 
 def _warn(view: View) -> None:

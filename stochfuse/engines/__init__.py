@@ -17,3 +17,13 @@ def uncollected() -> Iterator[None]:
     finally:
         if enabled:
             gc.enable()
+
+
+class Progress:
+    """Told what long work is about to do and how far it is; this one says nothing."""
+
+    def expect(self, outcomes: int, graphs: int) -> None:
+        """Told once, before long work starts: number of outcomes, and of different states expected in the last layer."""
+
+    def advance(self, step: int, done: int, total: int) -> None:
+        """Told within a step; step 0 stands for work that is not divided into steps."""

@@ -23,11 +23,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.engines import uncollected
-from stochfuse.errors import NoAnswerError, UsageError
+from stochfuse.engines import Progress, uncollected
+from stochfuse.errors import UsageError
 from stochfuse.estimators import Estimator
 from stochfuse.events import Event, Outcome, Rows, Weights, concerning, fates, outcomes
-from stochfuse.information import Information
+from stochfuse.information import Information, check_definite
 from stochfuse.kalman import Estimate, from_information
 
 MOST_GENERATORS = 6
@@ -60,21 +60,20 @@ class View(NamedTuple):
 
 
 class Ending(NamedTuple):
-    """Everything that can be claimed at one step: states with their weights, and views of what follows."""
+    """Everything that can be claimed at one step.
 
+    Parameters
+    ----------
+    step : number of the step.
+    weights : weight of every state, on the weights' axis.
+    views : what the agents can fuse from there.
+    events : events up to this step.
+    """
+
+    step: int
     weights: np.ndarray
     views: list[View]
     events: int
-
-
-class Progress:
-    """What an enumeration tells while it works; this one says nothing."""
-
-    def expect(self, outcomes: int, graphs: int) -> None:
-        """Told once, before long work starts: number of outcomes, and of different states expected in the last layer."""
-
-    def advance(self, step: int, done: int, total: int) -> None:
-        """Told within a step."""
 
 
 @dataclass(frozen=True)
@@ -146,12 +145,13 @@ def _enumerate(estimator: Estimator, request: Request, progress: Progress) -> St
     start = estimator.start()
     layer: dict[Any, Any] = {estimator.exchange(start) if request.plain else start: weights.one()}
     sizes, announced = [1], False
-    endings = [_ending(estimator, layer, drawn[0], 0, events_up_to[0], request)]
+    endings = [_ending(estimator, layer, drawn[0], 0, events_up_to[0], 1, request)]
     for step in range(2, steps + 1):
         before, last = drawn[step - 2 : step]
         degree = events_up_to[step - 2] - two_steps * len(before)
         if two_steps:
-            endings.append(_two_step_ending(estimator, layer, before, last, degree, events_up_to[step - 1], request))
+            total = events_up_to[step - 1]
+            endings.append(_two_step_ending(estimator, layer, before, last, degree, total, step, request))
         if step < steps or not two_steps:
             left = steps - step + 1
             expected = _expected(sizes, len(layer) * number[step - 1] // number[step - 2])
@@ -165,14 +165,19 @@ def _enumerate(estimator: Estimator, request: Request, progress: Progress) -> St
                 layer = _likeliest(layer, request.most)
             sizes.append(len(layer))
         if not two_steps:
-            endings.append(_ending(estimator, layer, last, degree, events_up_to[step - 1], request))
+            endings.append(_ending(estimator, layer, last, degree, events_up_to[step - 1], step, request))
     if not announced:
         progress.expect(number[steps], sizes[-1])
     return Structure(endings, sizes, number[1:])
 
 
 def _next_layer(
-    estimator: Estimator, layer: dict[Any, Any], possible: list[Outcome], step: int, request: Request, progress: Progress
+    estimator: Estimator,
+    layer: dict[Any, Any],
+    possible: list[Outcome],
+    step: int,
+    request: Request,
+    progress: Progress,
 ) -> dict[Any, Any]:
     times, found = request.weights.times, {}
     total = len(layer)
@@ -205,9 +210,7 @@ def _extrapolated(sizes: list[int], expected: int, further: int) -> int:
     return round(expected * (expected / sizes[-1]) ** max(0, further))
 
 
-def _check_size(
-    expected: int, drawn: list[Event], options: int, number: int, step: int, request: Request
-) -> None:
+def _check_size(expected: int, drawn: list[Event], options: int, number: int, step: int, request: Request) -> None:
     instead = "use --method optimal or --method monte-carlo, fewer steps or fewer agents"
     if options ** len(drawn) > MOST_CELLS >> 4:
         raise TooManyError(
@@ -222,7 +225,13 @@ def _check_size(
 
 
 def _ending(
-    estimator: Estimator, layer: dict[Any, Any], last: list[Event], degree: int, events: int, request: Request
+    estimator: Estimator,
+    layer: dict[Any, Any],
+    last: list[Event],
+    degree: int,
+    events: int,
+    step: int,
+    request: Request,
 ) -> Ending:
     """Carry out the last exchange for every state: one view per agent."""
     weights, views = request.weights, []
@@ -237,7 +246,7 @@ def _ending(
             shares = [share if g == group else None for g in range(len(request.groups))]
             cells = np.arange(len(possible))
             views.append(View(ids, ((1, cells),), cells, factors, shares))
-    return Ending(weights.table(list(layer.values()), degree), views, events)
+    return Ending(step, weights.table(list(layer.values()), degree), views, events)
 
 
 def _two_step_ending(
@@ -247,6 +256,7 @@ def _two_step_ending(
     last: list[Event],
     degree: int,
     events: int,
+    step: int,
     request: Request,
 ) -> Ending:
     """The last two exchanges for every state, through the lattice of what can be common."""
@@ -272,7 +282,7 @@ def _two_step_ending(
         views.append((terms, starts, factors, shares))
     ids = np.array([table.values(estimator.exchange(state)) for state in layer])
     made = [View(ids, tuple((s, i) for s, i in terms if i is not None), *rest) for terms, *rest in views]
-    return Ending(weights.table(list(layer.values()), degree), made, events)
+    return Ending(step, weights.table(list(layer.values()), degree), made, events)
 
 
 def _last_heard(last: list[Event], request: Request) -> dict[int, list[Any]]:
@@ -321,9 +331,7 @@ class _Table:
         self._clauses: list[tuple[int, ...]] = []
         self._removes = estimator.removes
         points = np.arange(1 << agents, dtype=np.uint64)
-        variables = [
-            sum((1 << int(p)) for p in points if int(p) >> i & 1) for i in range(agents)
-        ]
+        variables = [sum((1 << int(p)) for p in points if int(p) >> i & 1) for i in range(agents)]
         self._truth = np.zeros(1 << agents, dtype=np.uint64)
         for i, variable in enumerate(variables):
             with_i = (points >> np.uint64(i) & np.uint64(1)).astype(bool)
@@ -379,7 +387,7 @@ def claimed(ending: Ending, values: Information) -> Iterator[tuple[View, slice, 
             states = slice(first, first + size)
             ids = view.ids[states]
             total = _summed(Y, ids, view.terms)
-            _check_definite(total)
+            check_definite(total, ending.step)
             information = Information(None if y is None else _summed(y, ids, view.terms), total)
             yield view, states, from_information(information)
 
@@ -389,17 +397,6 @@ def _summed(values: np.ndarray, ids: np.ndarray, terms: tuple[tuple[int, np.ndar
     for sign, index in terms:
         total = total + sign * values[ids[:, index]]
     return total
-
-
-def _check_definite(Y: np.ndarray) -> None:
-    try:
-        fine = bool((Y > 0).all()) if Y.shape[-1] == 1 else np.isfinite(np.linalg.cholesky(Y)).all()
-    except np.linalg.LinAlgError:
-        fine = False
-    if not fine:
-        raise NoAnswerError(
-            "the information claimed in some outcome is not positive definite: what is taken for common exceeds what is known"
-        )
 
 
 def expectation(ending: Ending, values: Information, weights: Weights, groups: int) -> list[Estimate]:

@@ -7,9 +7,12 @@ that the sample depends on the seed alone and not on the number of workers.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import nullcontext
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager, nullcontext
+from itertools import repeat
+from multiprocessing import active_children
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +25,8 @@ from stochfuse.kalman import from_information
 
 BLOCK = 1000
 """Runs drawn from one seed."""
+MOST_BLOCKS = 50
+"""Blocks that a process has in hand at a time."""
 MERGE_BELOW = 0.2
 """Different histories per run up to which states are merged: beyond, nearly every run goes its own way."""
 
@@ -61,38 +66,53 @@ class Sample(NamedTuple):
     index: np.ndarray
 
 
-def sample(experiment: Experiment, rows: int, *, workers: int = 1, progress: Callable[[int, int], None] | None = None) -> Sample:
+def sample(
+    experiment: Experiment, rows: int, *, workers: int = 1, progress: Callable[[int, int], None] | None = None
+) -> Sample:
     """Draw `runs` histories for every row.
 
     Parameters
     ----------
     workers : processes that share the work; the sample does not depend on them.
-    progress : called with blocks done and blocks in all.
+    progress : called with parts of the work done and in all.
     """
     blocks = [(row, block) for row in range(rows) for block in range(-(-experiment.runs // BLOCK))]
-    share = -(-len(blocks) // max(1, workers))
+    # few large parts: the more runs a process has in hand, the more histories it meets twice
+    share = min(MOST_BLOCKS, max(1, -(-len(blocks) // max(1, workers))))
     parts = [blocks[first : first + share] for first in range(0, len(blocks), share)]
-    pool: Any = ProcessPoolExecutor(len(parts)) if len(parts) > 1 else nullcontext()
-    with pool as executor:
-        done = _each(executor, experiment, parts)
-        values, index, offset = [], np.empty((rows, experiment.runs, len(experiment.events), experiment.agents), np.int32), 0
-        for part, (P, which) in zip(parts, done, strict=True):
-            first = 0
+    index = np.empty((rows, experiment.runs, len(experiment.events), experiment.agents), np.int32)
+    values: list[np.ndarray] = []
+    pool: Any = ProcessPoolExecutor(min(workers, len(parts)), initializer=_quietly) if min(workers, len(parts)) > 1 else nullcontext()
+    with pool as executor, _stopped_together():
+        found = map(run_blocks, repeat(experiment), parts)
+        if executor is not None:
+            found = executor.map(run_blocks, repeat(experiment), parts)
+        for done, (part, (P, which)) in enumerate(zip(parts, found, strict=True), start=1):
+            which, first = which + sum(map(len, values)), 0
             for row, block in part:
                 runs = _runs_of(block, experiment.runs)
-                index[row, block * BLOCK : block * BLOCK + runs] = which[first : first + runs] + offset
+                index[row, block * BLOCK : block * BLOCK + runs] = which[first : first + runs]
                 first += runs
             values.append(P)
-            offset += len(P)
             if progress:
-                progress(parts.index(part) + 1, len(parts))
+                progress(done, len(parts))
     return Sample(np.concatenate(values), index)
 
 
-def _each(executor: Executor | None, experiment: Experiment, parts: Sequence[Any]) -> Any:
-    if executor is None:
-        return (run_blocks(experiment, part) for part in parts)
-    return executor.map(run_blocks, [experiment] * len(parts), parts)
+@contextmanager
+def _stopped_together() -> Iterator[None]:
+    """Let no process go on working for a result that nobody waits for."""
+    try:
+        yield
+    except BaseException:
+        for child in active_children():
+            child.terminate()
+        raise
+
+
+def _quietly() -> None:
+    """Let Ctrl-C end a worker without a traceback: the parent tells the user."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def run_blocks(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
@@ -181,9 +201,7 @@ def _moved(fates: np.ndarray, events: Sequence[Event], place_of: np.ndarray) -> 
     different, run_of = np.unique(place_of, axis=0, return_inverse=True)
     if len(different) == 1 and (different[0] == np.arange(len(different[0]))).all():
         return fates
-    to = [
-        [number[int(p[e.sender]), tuple(sorted(int(p[r]) for r in e.receivers))] for e in events] for p in different
-    ]
+    to = [[number[int(p[e.sender]), tuple(sorted(int(p[r]) for r in e.receivers))] for e in events] for p in different]
     out = np.empty_like(fates)
     np.put_along_axis(out, np.array(to).reshape(len(different), -1)[run_of.ravel()], fates, axis=1)
     return out
@@ -216,6 +234,8 @@ def _draw(experiment: Experiment, row: int, block: int) -> list[np.ndarray]:
         arrived = generator.random((runs, len(events))) < µ
         late = 0
         if len(delays) > 1:
-            late = np.minimum(np.searchsorted(delays, generator.random((runs, len(events))), side="right"), len(delays) - 1)
+            late = np.minimum(
+                np.searchsorted(delays, generator.random((runs, len(events))), side="right"), len(delays) - 1
+            )
         out.append(np.where(arrived, 1 + late, 0))
     return out

@@ -71,9 +71,7 @@ class Estimator(Protocol):
         ...
 
 
-def best_relabelling(
-    invariants: Sequence[Hashable], relabellings: Sequence[tuple[int, ...]]
-) -> list[tuple[int, ...]]:
+def best_relabelling(invariants: Sequence[Hashable], relabellings: Sequence[tuple[int, ...]]) -> list[tuple[int, ...]]:
     """Return the relabellings of like agents that put invariants into their least order.
 
     Parameters

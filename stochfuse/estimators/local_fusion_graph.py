@@ -225,9 +225,7 @@ class GraphExchange:
                     waiting[receiver, left] = waiting.get((receiver, left), 0) | mask
         return agents, waiting
 
-    def _merged(
-        self, agents: Sequence[Agent], waiting: dict[tuple[int, int], int]
-    ) -> tuple[State, tuple[int, ...]]:
+    def _merged(self, agents: Sequence[Agent], waiting: dict[tuple[int, int], int]) -> tuple[State, tuple[int, ...]]:
         kept = self._reachable([agent.known for agent in agents], list(waiting.values()))
         nodes = [node for node in range(kept.bit_length()) if kept >> node & 1]
         values, below, step = self.pedigrees.values, self.pedigrees.below, self.estimator.ledger.step

@@ -9,15 +9,33 @@ import numpy as np
 
 from stochfuse import __version__
 from stochfuse.errors import StochfuseError, UsageError
-from stochfuse.metrics import Metric
+from stochfuse.general import parse_statistic
+from stochfuse.metrics import Metric, power
 from stochfuse.prediction import Prediction
 from stochfuse.report.table import Table, number, to_csv
 
 SCHEMA = "stochfuse.prediction/1"
-METHOD_TITLES = {"simplified": "simplified formulation (54)"}
-NATURES = {
-    ("simplified", "approximate"): "approximate (mean field)",
+METHOD_TITLES = {
+    "simplified": "simplified formulation (54)",
+    "general": "general formulation (49)",
+    "naive": "general formulation (49)",
+    "monte-carlo": "Monte Carlo",
 }
+ESTIMATOR_TITLES = {
+    "broadcast-prior": "",
+    "local-fusion-graph": " of the Local Fusion Graph",
+    "naive": " of naive fusion (42)/(43)",
+}
+STATISTICS = {
+    "variance": "variance over the outcomes of the {what}",
+    "std": "standard deviation over the outcomes of the {what}",
+    "quantile": "{number:g}-quantile over the outcomes of the {what}",
+    "at-most": "probability that the {what} is at most {number:g}{unit}",
+    "derivative": "derivative in µ of the expected {what}",
+}
+LEVEL = 0.95
+WIDTH_95 = 1.959963984540054
+"""Half-width of a 95 % confidence interval in standard errors."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +49,7 @@ class View:
     agent : "mean", "worst", "best" or a number from 1.
     baseline : the same prediction at link probability 0, to normalise by, or None.
     digits : significant digits in tables.
+    statistic : "mean", or what of the metric's distribution over the outcomes, see `Prediction.statistic`.
     """
 
     prediction: Prediction
@@ -38,14 +57,26 @@ class View:
     agent: int | str = "mean"
     baseline: Prediction | None = None
     digits: int = 5
+    statistic: str = "mean"
 
     @property
     def unit(self) -> str:
         """Unit of the values; empty where there is none."""
-        return "" if self.baseline else self.metric.unit
+        if self.baseline or self.statistic.startswith("at-most"):
+            return ""
+        return power(self.metric.unit, 2) if self.statistic == "variance" else self.metric.unit
+
+    def errors(self) -> np.ndarray | None:
+        """Standard errors of the values where they are sampled, shape (links, steps)."""
+        errors = self.prediction.standard_error(self.metric, self.agent)
+        if errors is None or self.baseline is None:
+            return errors
+        return self._normalised(errors, self.baseline.values(self.metric, self.agent))
 
     def values(self) -> np.ndarray:
         """Values shown, shape (links, steps)."""
+        if self.statistic != "mean":
+            return _finite(self.prediction.statistic(self.statistic, self.metric, self.agent))
         values = self.prediction.values(self.metric, self.agent)
         return _finite(self._normalised(values, self.baseline and self.baseline.values(self.metric, self.agent)))
 
@@ -70,7 +101,12 @@ class View:
         unit = f" [{self.unit}]" if self.unit else ", relative to link probability 0" if self.baseline else ""
         if not unit:
             unit = " [mixed units]" if self.metric.mixed else "" if any(p.scenario.model.units) else " [no unit given]"
-        return f"Expected {p.quantity} {p.stage} covariance: {self.metric.label}{unit}"
+        if self.statistic == "mean":
+            return f"Expected {p.quantity} {p.stage} covariance: {self.metric.label}{unit}"
+        kind, number = parse_statistic(self.statistic)
+        own = f" {self.metric.unit}" if self.metric.unit else ""
+        text = STATISTICS[kind].format(what=self.metric.label, number=number, unit=own)
+        return f"{p.quantity.capitalize()} {p.stage} covariance: {text}" + ("" if kind == "at-most" else unit)
 
     @property
     def whom(self) -> str:
@@ -94,7 +130,18 @@ class View:
     def how(self) -> str:
         """One line: the method and how exact it is."""
         p = self.prediction
-        return f"{METHOD_TITLES[p.method]}; {NATURES[p.method, p.nature]}"
+        return f"{METHOD_TITLES[p.method]}{ESTIMATOR_TITLES[p.estimator]}; {self.nature}"
+
+    @property
+    def nature(self) -> str:
+        """How exact the values are, in words."""
+        p = self.prediction
+        if p.sampled is not None:
+            return f"sampled, {p.sampled.runs:,} runs, seed {p.meta['seed']}; ± one standard error"
+        if p.outcomes is None:
+            return "approximate (mean field)"
+        everything = f"{p.meta['outcomes']:,} outcomes"
+        return f"exact, {everything}" if p.nature == "exact" else f"approximate, the likeliest of {everything}"
 
 
 def _finite(values: np.ndarray) -> np.ndarray:
@@ -106,14 +153,16 @@ def _finite(values: np.ndarray) -> np.ndarray:
 def predict_table(view: View) -> Table:
     """Return rows of link probabilities (or cases) against columns of steps."""
     p = view.prediction
-    values, steady = view.values(), view.steady()
+    values, errors, steady = view.values(), view.errors(), view.steady()
     columns = [f"k={k}" for k in p.steps] + (["steady"] if steady is not None else [])
     uniform = p.cases is None and _uniform(p)
     rows = []
     for i, µ in enumerate(p.link):
         name = () if p.cases is None else (p.cases[i],)
-        shown = [*values[i], *([] if steady is None else [steady[i]])]
-        rows.append((*name, f"{µ:.6g}" if uniform else f"{µ:.4g}", *(number(v, view.digits) for v in shown)))
+        shown = [number(v, view.digits) for v in (*values[i], *([] if steady is None else [steady[i]]))]
+        if errors is not None:
+            shown = [f"{value} ±{error:.2g}" for value, error in zip(shown, errors[i], strict=True)]
+        rows.append((*name, f"{µ:.6g}" if uniform else f"{µ:.4g}", *shown))
     mean = "µ" if uniform else "mean µ"
     keys = (mean,) if p.cases is None else ("links", mean)
     return Table((view.what, view.whom, view.how), keys, tuple(columns), tuple(rows))
@@ -126,17 +175,21 @@ def _uniform(p: Prediction) -> bool:
 def predict_csv(view: View) -> str:
     """One line per link probability and step, with everything that says what the value is."""
     p = view.prediction
-    values, steady = view.values(), view.steady()
+    values, errors, steady = view.values(), view.errors(), view.steady()
     metric = view.metric.name + ("/at-link-0" if view.baseline else "")
+    metric = metric if view.statistic == "mean" else f"{view.statistic}({metric})"
     labels = (p.method, p.quantity, p.stage, p.nature, metric, view.unit, view.agent)
     rows = []
     for i, µ in enumerate(p.link):
         case = "" if p.cases is None else p.cases[i]
         rows += [(*labels, case, float(µ), int(k), float(v)) for k, v in zip(p.steps, values[i], strict=True)]
+        if errors is not None:
+            new = slice(-len(p.steps), None)
+            rows[new] = [(*row, float(error)) for row, error in zip(rows[new], errors[i], strict=True)]
         if steady is not None:
             rows.append((*labels, case, float(µ), "steady", float(steady[i])))
     headings = ("method", "quantity", "stage", "nature", "metric", "unit", "agent", "case", "link", "step", "value")
-    return to_csv(headings, rows)
+    return to_csv(headings if errors is None else (*headings, "standard_error"), rows)
 
 
 def predict_json(view: View) -> dict[str, Any]:
@@ -164,8 +217,26 @@ def predict_json(view: View) -> dict[str, Any]:
             "units": list(model.units),
             "forms": list(p.forms),
             "notes": list(p.notes),
+            "estimator": p.estimator,
+            **p.meta,
         },
     }
+    if view.statistic != "mean":
+        result["statistic"] = view.statistic
+    errors = view.errors()
+    if errors is not None:
+        half = WIDTH_95 * errors
+        result["standard_error"] = errors.tolist()
+        result["interval"] = {
+            "level": LEVEL,
+            "low": (view.values() - half).tolist(),
+            "high": (view.values() + half).tolist(),
+        }
+    elif view.metric.linear and view.statistic == "mean" and not view.baseline:
+        polynomials = p.polynomials(view.metric, view.agent)
+        if polynomials is not None:
+            # E(µ) = sum over c of coefficients[c] µ^c (1−µ)^(L−c), L + 1 = len(coefficients), one list per step
+            result["bernstein"] = [coefficients.tolist() for coefficients in polynomials]
     if p.cases is not None:
         result["cases"] = list(p.cases)
     if steady is not None and p.steady_bound is not None:

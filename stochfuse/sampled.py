@@ -1,0 +1,118 @@
+"""Monte Carlo for a scenario: the sample, its means, and how far they can be trusted.
+
+Standard errors are those of the mean over independent runs.  Agents that are alike are averaged within a run first; their
+errors are dependent, the runs are not.  For a metric that is not linear in the covariance the error is carried through
+by the metric's derivative at the mean (delta method), taken by central differences.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from stochfuse.engines import Progress
+from stochfuse.engines.monte_carlo import Experiment, Sample, sample
+from stochfuse.errors import UsageError
+from stochfuse.events import events, orbits, relabellings
+from stochfuse.general import ESTIMATORS, sources_of
+from stochfuse.metrics import Metric
+from stochfuse.network import LinkRows
+from stochfuse.scenario import Scenario
+
+MANY = 10_000
+"""Runs, over all rows, from which on another process pays for its start."""
+STEP = 1e-4
+"""Share of a run's deviation from the mean over which the derivative of a metric is taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """A sample of claimed covariances.
+
+    Parameters
+    ----------
+    sample : different covariances, and which of them each agent claims in each run.
+    groups : agents that are alike.
+    """
+
+    sample: Sample
+    groups: tuple[tuple[int, ...], ...]
+
+    @property
+    def runs(self) -> int:
+        """Runs per row."""
+        return self.sample.index.shape[1]
+
+    def covariance(self) -> np.ndarray:
+        """Mean covariance per group, (rows, steps, groups, d, d)."""
+        values, index = self.sample
+        out = np.empty((index.shape[0], index.shape[2], len(self.groups), *values.shape[1:]))
+        for g, agents in enumerate(self.groups):
+            for row in range(len(index)):
+                for step in range(index.shape[2]):
+                    counts = np.bincount(index[row, :, step][:, list(agents)].ravel(), minlength=len(values))
+                    used = np.flatnonzero(counts)
+                    out[row, step, g] = np.tensordot(counts[used], values[used], axes=1) / counts.sum()
+        return out
+
+    def standard_error(self, metric: Metric, agents: tuple[int, ...]) -> np.ndarray:
+        """Standard error of the metric of the mean over some agents, (rows, steps)."""
+        values, index = self.sample
+        out = np.empty((index.shape[0], index.shape[2]))
+        for row in range(len(index)):
+            for step in range(index.shape[2]):
+                P = values[index[row, :, step][:, list(agents)]].mean(axis=1)
+                mean = P.mean(axis=0)
+                deviation = STEP * (P - mean)
+                slope = (metric.of(mean + deviation) - metric.of(mean - deviation)) / (2 * STEP)
+                out[row, step] = np.sqrt((slope**2).sum() / (self.runs - 1) / self.runs)
+        return out
+
+
+def sampled(
+    scenario: Scenario,
+    rows: LinkRows,
+    estimator: str = "local-fusion-graph",
+    *,
+    runs: int = 1000,
+    seed: int = 1,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> Sampled:
+    """Draw a sample of an estimator's claimed covariances.
+
+    Parameters
+    ----------
+    runs : independent runs for every row, at least 2.
+    seed : of the random numbers; the same seed gives the same sample, whatever the number of workers.
+    workers : processes; default: one for small samples, else one per processor.
+    progress : told how many parts of the work are done.
+
+    Raises
+    ------
+    UsageError
+        If runs, seed or workers are out of range.
+    """
+    for name, value, least in (("runs", runs, 2), ("seed", seed, 0), ("workers", 1 if workers is None else workers, 1)):
+        if value < least:
+            raise UsageError(f"{name}: expected a whole number of at least {least}, got {value}")
+    network, labels = scenario.network, scenario.sensor_of
+    permutations = relabellings(network, rows, labels)
+    shared = scenario.correlation == "shared"
+    experiment = Experiment(
+        agents=network.agents,
+        events=[events(network, rows, step) for step in range(1, network.steps + 1)],
+        delay=network.delay,
+        estimator=partial(ESTIMATORS[estimator], sources=labels, shared=shared, relabellings=permutations),
+        sources=sources_of(scenario),
+        runs=runs,
+        seed=seed,
+    )
+    if workers is None:
+        workers = len(os.sched_getaffinity(0)) if runs * len(rows.link) >= MANY else 1
+    told = None if progress is None else lambda done, total: progress.advance(0, done, total)
+    drawn = sample(experiment, len(rows.link), workers=workers, progress=told)
+    return Sampled(drawn, tuple(orbits(network.agents, permutations)))
