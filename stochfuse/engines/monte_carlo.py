@@ -82,7 +82,11 @@ def sample(
     parts = [blocks[first : first + share] for first in range(0, len(blocks), share)]
     index = np.empty((rows, experiment.runs, len(experiment.events), experiment.agents), np.int32)
     values: list[np.ndarray] = []
-    pool: Any = ProcessPoolExecutor(min(workers, len(parts)), initializer=_quietly) if min(workers, len(parts)) > 1 else nullcontext()
+    pool: Any = (
+        ProcessPoolExecutor(min(workers, len(parts)), initializer=_quietly)
+        if min(workers, len(parts)) > 1
+        else nullcontext()
+    )
     with pool as executor, _stopped_together():
         found = map(run_blocks, repeat(experiment), parts)
         if executor is not None:
