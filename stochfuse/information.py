@@ -70,10 +70,11 @@ class Ledger:
     def combine(self, step: int, terms: Iterable[tuple[int, int]]) -> int:
         """Σ coefficient · value over (value, coefficient), each brought forward to the step."""
         total: dict[int, int] = {}
+        steps, sums = self.step, self.sums
         for value, coefficient in terms:
-            for atom, times in self.sums[self.forward(value, step)]:
+            for atom, times in sums[value if steps[value] == step else self.forward(value, step)]:
                 total[atom] = total.get(atom, 0) + coefficient * times
-        return self._value(step, tuple(sorted((a, c) for a, c in total.items() if c)))
+        return self._value(step, tuple(sorted([pair for pair in total.items() if pair[1]])))
 
     def _atom(self, kind: str, step: int, of: int) -> int:
         key = (kind, step, of)

@@ -88,9 +88,11 @@ def sample(
         else nullcontext()
     )
     with pool as executor, _stopped_together():
-        found = map(run_blocks, repeat(experiment), parts)
-        if executor is not None:
-            found = executor.map(run_blocks, repeat(experiment), parts)
+        if executor is None:
+            found = map(run_blocks, repeat(experiment), parts)
+        else:
+            tasks = [executor.submit(run_blocks, experiment, part) for part in parts]
+            found = (task.result() for task in tasks)
         for done, (part, (P, which)) in enumerate(zip(parts, found, strict=True), start=1):
             which, first = which + sum(map(len, values)), 0
             for row, block in part:
@@ -168,17 +170,16 @@ class _Histories:
         different: np.ndarray,
     ) -> None:
         self.estimator, self.agents = estimator, agents
-        self.each = []
-        for exchange, *fates in different.tolist():
-            heard = [1 << i for i in range(agents)]
-            late = []
-            for (sender, receivers, _), fate in zip(events, fates, strict=True):
-                if fate == 1:
-                    for receiver in receivers:
-                        heard[receiver] |= 1 << sender
-                elif fate > 1:
-                    late += [Late(receiver, fate - 1, sender) for receiver in receivers]
-            self.each.append((exchanges[exchange], heard, late))
+        fates = different[:, 1:]
+        heard = np.tile(1 << np.arange(agents), (len(different), 1))
+        late: list[list[Late]] = [[] for _ in range(len(different))]
+        for event, fate in zip(events, fates.T, strict=True):
+            for receiver in event.receivers:
+                heard[:, receiver] |= (fate == 1).astype(int) << event.sender
+                for pair in np.flatnonzero(fate > 1):
+                    late[pair].append(Late(receiver, int(fate[pair]) - 1, event.sender))
+        of = [exchanges[exchange] for exchange in different[:, 0]]
+        self.each = list(zip(of, heard.tolist(), late, strict=True))
 
     def fused(self) -> np.ndarray:
         """What is claimed at every place, (pairs, agents)."""

@@ -79,18 +79,15 @@ class Pedigrees:
             mask &= ~self.below[top]
 
     def terms(self, mask: int) -> dict[int, int]:
-        """Inclusion–exclusion (1) over the maximal nodes: coefficient of every intersection that does not cancel."""
+        """Inclusion–exclusion (1) over the maximal nodes: the coefficient of every intersection."""
         terms: dict[int, int] = {}
         for top in self.maximal(mask):
             below = self.below[top]
-            found = {below: 1}
-            for other, coefficient in terms.items():
-                shared = other & below
-                if shared:
-                    found[shared] = found.get(shared, 0) - coefficient
-            for shared, coefficient in found.items():
-                terms[shared] = terms.get(shared, 0) + coefficient
-        return {shared: coefficient for shared, coefficient in terms.items() if coefficient}
+            found = [(below, 1)]
+            found += [(other & below, -times) for other, times in terms.items() if other & below]
+            for shared, times in found:
+                terms[shared] = terms.get(shared, 0) + times
+        return terms
 
     def fuse(self, mask: int) -> int:
         """Value of a pedigree at its latest node's step."""
@@ -102,7 +99,7 @@ class Pedigrees:
             if mask == self.below[top]:
                 known = self.values[top]
             else:
-                terms = [(self.fuse(shared), times) for shared, times in self.terms(mask).items()]
+                terms = [(self.fuse(shared), times) for shared, times in self.terms(mask).items() if times]
                 known = self.ledger.combine(self.ledger.step[self.values[top]], terms)
             self._known[mask] = known
         return known
@@ -185,7 +182,7 @@ class GraphExchange:
 
     def fused(self, agent: int, heard: int) -> int:
         """Value that an agent claims after hearing some agents, with what else is due."""
-        return self.pedigrees.fuse(self.known(agent, heard))
+        return self.pedigrees.fuse(self.mask(heard) | self._due[agent])
 
     def known(self, agent: int, heard: int) -> int:
         """Pedigree of an agent after hearing some agents, with what else is due."""
