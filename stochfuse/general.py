@@ -284,8 +284,13 @@ def outcomes(
     return Outcomes(scenario, rows, groups, structure, evaluate(ledger, sources), weights)
 
 
-def sources_of(scenario: Scenario, records: np.ndarray | None = None) -> Sources:
+def sources_of(scenario: Scenario, records: np.ndarray | None = None, *, by_agent: bool = False) -> Sources:
     """Return what start and measurements of every source are worth.
+
+    Parameters
+    ----------
+    records : measurements (steps, agents, p); with them every agent is a source of its own.
+    by_agent : whether that is so anyway; else every kind of sensor is one.
 
     Raises
     ------
@@ -299,10 +304,10 @@ def sources_of(scenario: Scenario, records: np.ndarray | None = None) -> Sources
         start = None
     if start is None or not np.isfinite(start.Y).all():
         raise UsageError("initial.P: expected an invertible covariance for the Local Fusion Graph, got a singular one")
-    if records is None:
-        return Sources(scenario.model, scenario.sensors, [start] * len(scenario.sensors))
-    sensors = [scenario.sensors[kind] for kind in scenario.sensor_of]
-    columns = [[z[..., None] for z in step] for step in records]
+    sensors = scenario.sensors
+    if by_agent or records is not None:
+        sensors = [scenario.sensors[kind] for kind in scenario.sensor_of]
+    columns = None if records is None else [[z[..., None] for z in step] for step in records]
     return Sources(scenario.model, sensors, [start] * len(sensors), columns)
 
 

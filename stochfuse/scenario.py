@@ -152,6 +152,18 @@ def read_text(source: str | Path) -> tuple[str, str]:
     """Return name and text of a preset, a file or standard input."""
     if is_preset(source):
         return str(source), (_PRESETS / f"{source}.toml").read_text(encoding="utf-8")
+    known = ", ".join(preset_names())
+    return read_file(source, f"no such file, and no preset of that name (presets: {known})")
+
+
+def read_file(source: str | Path, missing: str = "no such file") -> tuple[str, str]:
+    """Return name and text of a file, or of standard input for "-".
+
+    Raises
+    ------
+    ScenarioError
+        If it cannot be read; `missing` is what to say where there is none.
+    """
     if source == "-":
         if sys.stdin is None:
             raise ScenarioError("standard input", "closed")
@@ -162,8 +174,7 @@ def read_text(source: str | Path) -> tuple[str, str]:
     try:
         return str(path), path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        known = ", ".join(preset_names())
-        raise ScenarioError(str(path), f"no such file, and no preset of that name (presets: {known})") from None
+        raise ScenarioError(str(path), missing) from None
     except UnicodeDecodeError as error:
         raise ScenarioError(str(path), f"not a text file in UTF-8 (byte {error.start})") from None
     except OSError as error:

@@ -10,7 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from stochfuse import __version__
-from stochfuse.cli import derive, predict, scenario
+from stochfuse.cli import derive, graph, predict, scenario
 from stochfuse.errors import NoAnswerError, ScenarioError, StochfuseError, UsageError
 
 EXIT_FAILURE, EXIT_USAGE, EXIT_NO_ANSWER, EXIT_INTERRUPTED = 1, 2, 3, 130
@@ -62,6 +62,7 @@ app = typer.Typer(
 )
 app.command("predict")(predict.predict)
 app.command("derive")(derive.derive)
+app.command("graph")(graph.graph)
 app.add_typer(scenario.app, name="scenario")
 
 

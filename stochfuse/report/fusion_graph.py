@@ -1,0 +1,195 @@
+"""A Local Fusion Graph in words, as Graphviz DOT, as JSON and as a figure like those of the thesis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stochfuse import __version__
+from stochfuse.errors import StochfuseError
+from stochfuse.fusion_graph import Explanation, FusionGraph, Node, Term
+from stochfuse.report.export import write_file
+from stochfuse.report.table import number
+
+SCHEMA = "stochfuse.fusion-graph/1"
+REMOVED, OWN, OTHER = "#f4b183", "#9dc3e6", "#ffffff"
+
+
+def name(node: Node) -> str:
+    """Return a node's name: (agent,kStep), or the common start."""
+    return "start" if node[0] == 0 else f"({node[0]},k{node[1]})"
+
+
+def names(nodes: tuple[Node, ...]) -> str:
+    """Return several nodes' names."""
+    return name(nodes[0]) if len(nodes) == 1 else "{" + ", ".join(map(name, nodes)) + "}"
+
+
+def to_text(explanations: list[Explanation], traces: Mapping[Node, float] | None = None) -> str:
+    """Every fusion in words, one block each."""
+    blocks = []
+    for e in explanations:
+        lines = [f"agent {e.agent} at step {e.step} fuses {names(e.fused)}"]
+        if e.superseded:
+            lines.append(f"  {names(e.superseded)} arrived too, but was known already: it changes nothing")
+        lines += _lines(e.terms, 2)
+        if traces is not None:
+            lines.append(f"  claimed covariance, trace: {number(traces[e.agent, e.step])}")
+        blocks.append("\n".join(lines))
+    return "\n\n".join(blocks) + "\n"
+
+
+def _lines(terms: tuple[Term, ...], indent: int) -> list[str]:
+    lines = []
+    for term in terms:
+        sign = "+" if term.coefficient > 0 else "-"
+        times = f"{abs(term.coefficient)} × " if abs(term.coefficient) > 1 else ""
+        text = f"{' ' * indent}{sign} {times}{names(term.nodes)}"
+        if len(term.nodes) > 1:
+            text += f" fused at k{term.since}"
+        if term.until > term.since:
+            text += f"{' and' if len(term.nodes) > 1 else ','} brought forward from k{term.since} to k{term.until}"
+        if term.shared_by:
+            text += f"; common to {' and to '.join(map(names, term.shared_by))}"
+        lines.append(text)
+        lines += _lines(term.parts, indent + 4)
+    return lines
+
+
+def to_mapping(
+    graph: FusionGraph, explanations: list[Explanation], traces: Mapping[Node, float] | None
+) -> dict[str, Any]:
+    """Return an object with nodes, edges and what explains every fusion."""
+    return {
+        "schema": SCHEMA,
+        "version": __version__,
+        "agents": graph.history.agents,
+        "steps": graph.history.steps,
+        "nodes": [list(node) for node in graph.nodes],
+        "edges": [[list(parent), list(node)] for node in graph.nodes for parent in graph.parents(node)],
+        "fusions": [
+            {
+                "agent": e.agent,
+                "step": e.step,
+                "fused": [list(n) for n in e.fused],
+                "superseded": [list(n) for n in e.superseded],
+                "terms": [_term(t) for t in e.terms],
+                **({} if traces is None else {"claimed_trace": traces[e.agent, e.step]}),
+            }
+            for e in explanations
+        ],
+    }
+
+
+def _term(term: Term) -> dict[str, Any]:
+    return {
+        "coefficient": term.coefficient,
+        "nodes": [list(n) for n in term.nodes],
+        "since": term.since,
+        "until": term.until,
+        "shared_by": [[list(n) for n in nodes] for nodes in term.shared_by],
+        "parts": [_term(part) for part in term.parts],
+    }
+
+
+def _edges(graph: FusionGraph, shown: set[Node], agent: int, step: int) -> list[tuple[Node, Node, bool]]:
+    """(parent, child, late) among the nodes shown; the fused estimate is the node (agent, step + ½)."""
+    edges = [(p, n, p[1] < n[1] - 1) for n in shown for p in graph.parents(n)]
+    fused = (agent, step + 0.5)
+    edges += [(p, fused, p[1] < step) for p in graph.received(agent, step)]
+    return sorted(edges, key=lambda e: (e[1][1], e[1][0], e[0][1], e[0][0]))
+
+
+def _roles(graph: FusionGraph, explanation: Explanation) -> tuple[set[Node], set[Node]]:
+    """Return the nodes in the pedigree of a fusion, and those that were removed as common."""
+    shown = set().union(*(graph.ancestors(n) for n in graph.received(explanation.agent, explanation.step)))
+    removed = {n for term in explanation.terms if term.shared_by for n in term.nodes}
+    return shown, removed
+
+
+def to_dot(graph: FusionGraph, explanation: Explanation) -> str:
+    """One agent's graph at a step for Graphviz: parents above, one rank per step, late messages dashed, common nodes filled."""
+    shown, removed = _roles(graph, explanation)
+    agent, step = explanation.agent, explanation.step
+    lines = [
+        f'digraph "agent {agent} at step {step}" {{',
+        f'  label="Local fusion graph of agent {agent} after step {step}; filled: removed as common information"',
+        "  rankdir=LR; node [shape=circle, style=filled, fillcolor=white];",
+    ]
+    for k in range(1, step + 1):
+        here = sorted(n for n in shown if n[1] == k)
+        lines += [f"  {{ rank=same; {' '.join(f'{_id(n)};' for n in here)} }}"] if here else []
+    lines += [
+        f'  {_id(n)} [label="{name(n)[1:-1] if n[0] else name(n)}"'
+        + (f', fillcolor="{REMOVED}"' if n in removed else "")
+        + "];"
+        for n in sorted(shown, key=lambda n: (n[1], n[0]))
+    ]
+    lines.append(f'  fused [label="{agent},k{step}\\nfused", shape=doublecircle, fillcolor="{OWN}"];')
+    for parent, child, late in _edges(graph, shown, agent, step):
+        to = _id(child) if isinstance(child[1], int) else "fused"
+        lines.append(f"  {_id(parent)} -> {to}{' [style=dashed]' if late else ''};")
+    return "\n".join([*lines, "}"]) + "\n"
+
+
+def _id(node: Node) -> str:
+    return f"n{node[0]}_{node[1]}"
+
+
+def draw(graph: FusionGraph, explanation: Explanation):
+    """Return a figure of one agent's graph at a step: agents as rows, steps as columns, as in the thesis' figure 5."""
+    try:
+        from matplotlib.figure import Figure
+        from matplotlib.lines import Line2D
+        from matplotlib.patches import Patch
+    except ImportError:
+        raise StochfuseError("figures need matplotlib: pip install 'stochfuse[plot]'") from None
+    shown, removed = _roles(graph, explanation)
+    agent, step, n = explanation.agent, explanation.step, graph.history.agents
+    figure = Figure(figsize=(max(5.0, 1.9 * step + 2.2), max(3.2, 1.05 * n + 1.6)), layout="constrained")
+    axes = figure.add_subplot()
+    radius = 0.17
+
+    def place(node: tuple[float, float]) -> np.ndarray:
+        row = (n + 1) / 2 if node[0] == 0 else node[0]
+        return np.array([node[1] - (0.5 if node[0] == 0 else 0.0) + (0.15 if node[1] != int(node[1]) else 0.0), -row])
+
+    for parent, child, late in _edges(graph, shown, agent, step):
+        a, b = place(parent), place(child)
+        way = (b - a) / np.hypot(*(b - a))
+        axes.annotate(
+            "",
+            b - radius * way,
+            a + radius * way,
+            arrowprops={"arrowstyle": "->", "linestyle": "--" if late else "-", "color": "0.35", "lw": 1.1},
+        )
+    for node in sorted(shown):
+        x, y = place(node)
+        color = REMOVED if node in removed else OTHER
+        axes.plot(x, y, "o", markersize=27, color=color, markeredgecolor="black")
+        axes.text(x, y, "start" if node[0] == 0 else f"{node[0]},{node[1]}", ha="center", va="center", fontsize=9)
+    x, y = place((agent, step + 0.5))
+    axes.plot(x, y, "s", markersize=27, color=OWN, markeredgecolor="black")
+    axes.text(x, y, f"{agent},{step}f", ha="center", va="center", fontsize=9)
+    axes.set_xticks(range(1, step + 1), [f"k{k}" for k in range(1, step + 1)])
+    axes.set_yticks([-i for i in range(1, n + 1)], [f"agent {i}" for i in range(1, n + 1)])
+    axes.set_xlim(0.3 if graph.shared else 0.6, step + 1.1)
+    axes.set_ylim(-n - 0.5, -0.5)
+    axes.set_aspect("equal")
+    axes.set_title(f"Local fusion graph of agent {agent} after step {step}", fontsize="medium")
+    key = [
+        Patch(facecolor=OWN, edgecolor="black", label="fused estimate"),
+        Patch(facecolor=REMOVED, edgecolor="black", label="removed as common"),
+        Line2D([], [], color="0.35", linestyle="--", label="late message"),
+    ]
+    figure.legend(handles=key, loc="outside lower center", ncols=3, fontsize="small", frameon=False)
+    return figure
+
+
+def plot(graph: FusionGraph, explanation: Explanation, output: Path) -> None:
+    """Write the figure to a file."""
+    figure = draw(graph, explanation)
+    write_file(output, lambda path: figure.savefig(path, dpi=150))
