@@ -283,7 +283,7 @@ def derive_simplified(
     for name, value in (("agents", agents), ("step", step)):
         if not 1 <= value <= MOST_AGENTS_OR_STEPS:
             raise UsageError(f"{name}: expected 1 to {MOST_AGENTS_OR_STEPS} for formulas, got {value}")
-    numbers = [_number(n, v, s) for n, v, s in (("q", q, Q), ("r", r, R), ("p0", p0, P0))]
+    numbers = [exact_number(n, v, s) for n, v, s in (("q", q, Q), ("r", r, R), ("p0", p0, P0))]
     if numbers[1] == 0:
         raise UsageError("r: expected a positive number, got 0")
     if numbers[0] == 0 and numbers[2] == 0:
@@ -291,7 +291,14 @@ def derive_simplified(
     return SimplifiedForm(agents, step, *numbers, shared=correlation == "shared")
 
 
-def _number(name: str, value: Any, symbol: sympy.Symbol) -> sympy.Expr:
+def exact_number(name: str, value: Any, symbol: sympy.Symbol) -> sympy.Expr:
+    """Return a number exactly as typed, or the symbol for None.
+
+    Raises
+    ------
+    UsageError
+        If it is no number of at least 0.
+    """
     if value is None:
         return symbol
     try:

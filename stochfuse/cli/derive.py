@@ -7,13 +7,15 @@ from typing import Annotated
 
 import typer
 
-from stochfuse.cli.options import OutputOption
+from stochfuse.cli.options import Architecture, OutputOption
 
 
 class Formulation(StrEnum):
     """Formulations that can be derived."""
 
     simplified = "simplified"
+    general = "general"
+    naive = "naive"
 
 
 class FormulaFormat(StrEnum):
@@ -41,6 +43,9 @@ def derive(
     q: Annotated[str | None, _Number] = None,
     r: Annotated[str | None, _Number] = None,
     p0: Annotated[str | None, _Number] = None,
+    architecture: Annotated[
+        Architecture, typer.Option(help="general, naive: who may hear whom.")
+    ] = Architecture.ad_hoc,
     correlation: Annotated[Correlation, typer.Option(help="Initial estimates.")] = Correlation.independent,
     latex: Annotated[bool, typer.Option("--latex", help="The same as --format latex.")] = False,
     format: Annotated[
@@ -49,10 +54,12 @@ def derive(
     ] = None,
     output: OutputOption = None,
 ) -> None:
-    """Print the equations: chain, rational function of µ, derivative, series at µ = 0 and 1, fixed point.
+    """Print the equations, exact.
 
-    For like agents with a scalar state, F = G = H = 1. Forms too large to expand are given as a chain of named
-    sub-expressions; with numbers for q, r and p0 they stay small.
+    For like agents with a scalar state, F = G = H = 1. simplified: chain, rational function of µ, derivative, series at
+    µ = 0 and 1, fixed point. general: a polynomial in µ (a sum over every covariance that can be claimed), derivative,
+    and coefficients by number of arrivals; naive: the same for naive fusion. Forms too large to expand stay small with
+    numbers for q, r and p0.
     """
     import sys
 
@@ -63,18 +70,30 @@ def derive(
         raise UsageError("--latex and --format: expected one of them, got both")
     check_writable(output)
     from stochfuse.report import derivation
-    from stochfuse.symbolic import derive_simplified
+    from stochfuse.symbolic import SimplifiedForm, derive_simplified
 
-    form = derive_simplified(agents, step, q, r, p0, correlation=correlation.value)
-    if latex or format is FormulaFormat.latex:
-        text = derivation.to_latex(form)
-    elif format is FormulaFormat.json:
-        text = to_json(derivation.to_mapping(form))
-    elif output is None and sys.stdout.isatty():
-        text = derivation.to_pretty(form, terminal_width())
+    if formulation is Formulation.simplified:
+        if architecture is Architecture.cyclic:
+            raise UsageError("--architecture cyclic: expected formulation general, got simplified")
+        form = derive_simplified(agents, step, q, r, p0, correlation=correlation.value)
     else:
-        text = derivation.to_plain(form)
-    if not form.expandable:
+        from stochfuse.symbolic_general import derive_general
+
+        estimator = "naive" if formulation is Formulation.naive else "local-fusion-graph"
+        start = correlation.value
+        form = derive_general(
+            agents, step, q, r, p0, architecture=architecture.value, correlation=start, estimator=estimator
+        )
+    made = derivation.derivation(form)
+    if latex or format is FormulaFormat.latex:
+        text = derivation.to_latex(made)
+    elif format is FormulaFormat.json:
+        text = to_json(derivation.to_mapping(made))
+    elif output is None and sys.stdout.isatty():
+        text = derivation.to_pretty(made, terminal_width())
+    else:
+        text = derivation.to_plain(made)
+    if isinstance(form, SimplifiedForm) and not form.expandable:
         typer.echo(
             f"note: step {step} is given as a chain of named sub-expressions; the expanded form would fill pages "
             "(numbers for q, r and p0 keep it small)",

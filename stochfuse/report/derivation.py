@@ -9,6 +9,7 @@ import sympy
 
 from stochfuse import __version__
 from stochfuse.symbolic import FIXED, MOST_AGENTS_CLEARED, MU, SimplifiedForm
+from stochfuse.symbolic_general import GeneralForm
 
 SCHEMA = "stochfuse.derivation/1"
 
@@ -22,19 +23,83 @@ class Formula(NamedTuple):
     expression: sympy.Basic
 
 
-def title(form: SimplifiedForm) -> str:
-    """Say what the formulas are."""
+class Derivation(NamedTuple):
+    """Formulas with what they are.
+
+    Parameters
+    ----------
+    title : what the formulas are.
+    formulas : in the order of reading.
+    facts : method, agents, step and symbols.
+    latex : names that LaTeX writes differently.
+    """
+
+    title: str
+    formulas: list[Formula]
+    facts: dict[str, Any]
+    latex: dict[str, str]
+
+
+def derivation(form: SimplifiedForm | GeneralForm) -> Derivation:
+    """Return the formulas of a form that fit on pages."""
+    method = "general" if isinstance(form, GeneralForm) else "simplified"
+    facts = {
+        "method": method if not isinstance(form, GeneralForm) or form.estimator != "naive" else "naive",
+        "quantity": "claimed",
+        "agents": form.agents,
+        "step": form.step,
+        "symbols": ["mu", *map(str, form.symbols)],
+    }
+    if isinstance(form, GeneralForm):
+        return Derivation(_general_title(form), _general_formulas(form), facts, _latex_names(form.step))
+    priors = {str(name): _latex_prior(str(name)) for name, _ in form.chain if str(name).endswith("_prior")}
+    return Derivation(_simplified_title(form), _simplified_formulas(form), facts, _latex_names(form.step) | priors)
+
+
+def _agents(n: int) -> str:
+    return "1 agent" if n == 1 else f"{n} like agents"
+
+
+_SYMBOLS = "mu: link probability, q, r: process and measurement noise variance, p0: variance of the initial estimates"
+
+
+def _simplified_title(form: SimplifiedForm) -> str:
     start = "shared" if form.shared else "independent"
-    agents = "1 agent" if form.agents == 1 else f"{form.agents} like agents"
     return (
-        f"Simplified formulation (54), {agents}, scalar state with F = G = H = 1, {start} initial estimates: expected "
-        f"claimed posterior covariance P_k after step k (approximate: mean field). mu: link probability, q, r: process "
-        f"and measurement noise variance, p0: variance of the initial estimates"
+        f"Simplified formulation (54), {_agents(form.agents)}, scalar state with F = G = H = 1, {start} initial estimates: "
+        f"expected claimed posterior covariance P_k after step k (approximate: mean field). {_SYMBOLS}"
     )
 
 
-def formulas(form: SimplifiedForm) -> list[Formula]:
-    """Return the formulas that fit on pages: closed forms where they do, the chain where not."""
+def _general_title(form: GeneralForm) -> str:
+    start = "shared" if form.shared else "independent"
+    what = "naive fusion (42)/(43)" if form.estimator == "naive" else "the Local Fusion Graph"
+    return (
+        f"General formulation (49) of {what}, {_agents(form.agents)}, {form.architecture}, scalar state with F = G = H = "
+        f"1, {start} initial estimates: expected claimed posterior covariance P_k after step k (exact: every outcome). "
+        f"{_SYMBOLS}"
+    )
+
+
+def _general_formulas(form: GeneralForm) -> list[Formula]:
+    k = form.step
+    P_k, derivative = sympy.Symbol(f"P_{k}"), sympy.Symbol(f"dP_{k}_dmu")
+    says = f"P_{k} as a polynomial in mu"
+    if form.symbols:
+        says = f"P_{k}: every covariance that can be claimed, times the probability that it is, a polynomial in mu"
+    lines = [
+        Formula("closed", says, P_k, form.closed()),
+        Formula("derivative", f"derivative of P_{k} in mu", derivative, form.derivative()),
+    ]
+    if not form.symbols:
+        L = len(form.bernstein) - 1
+        for c, A in enumerate(form.bernstein):
+            text = f"sum of P_{k} over the outcomes in which exactly {c} of {L} messages arrive"
+            lines.append(Formula(f"A_{c}", text, sympy.Symbol(f"A_{c}"), A))
+    return lines
+
+
+def _simplified_formulas(form: SimplifiedForm) -> list[Formula]:
     k = form.step
     P_k, derivative = sympy.Symbol(f"P_{k}"), sympy.Symbol(f"dP_{k}_dmu")
     lines = []
@@ -61,62 +126,53 @@ def formulas(form: SimplifiedForm) -> list[Formula]:
     return lines
 
 
-def to_plain(form: SimplifiedForm) -> str:
+def to_plain(made: Derivation) -> str:
     """One `name = expression` per line, which SymPy can read back, with comments between."""
-    lines = textwrap.wrap(title(form), 100, initial_indent="# ", subsequent_indent="# ")
-    for formula in formulas(form):
+    lines = textwrap.wrap(made.title, 100, initial_indent="# ", subsequent_indent="# ")
+    for formula in made.formulas:
         lines += [f"# {formula.says}", f"{formula.name} = {formula.expression}"]
     return "\n".join(lines) + "\n"
 
 
-def to_pretty(form: SimplifiedForm, width: int) -> str:
+def to_pretty(made: Derivation, width: int) -> str:
     """Two-dimensional Unicode for a terminal."""
-    blocks = [textwrap.fill(title(form), width)]
-    for formula in formulas(form):
+    blocks = [textwrap.fill(made.title, width)]
+    for formula in made.formulas:
         equation = sympy.Eq(formula.name, formula.expression, evaluate=False)
         shown = sympy.pretty(equation, use_unicode=True, num_columns=width, wrap_line=True)
         blocks.append(f"{formula.says}:\n\n{shown}")
     return "\n\n".join(blocks) + "\n"
 
 
-def to_latex(form: SimplifiedForm) -> str:
+def to_latex(made: Derivation) -> str:
     """One equation environment per formula."""
-    names = {MU: r"\mu"}
-    lines = [f"% {title(form)}"]
-    for formula in formulas(form):
-        left = _latex_name(formula.key, form.step) or sympy.latex(formula.name)
-        right = sympy.latex(formula.expression, symbol_names={**names, **_priors(form)})
+    names = {MU: r"\mu", **{sympy.Symbol(key, positive=True): text for key, text in made.latex.items()}}
+    lines = [f"% {made.title}"]
+    for formula in made.formulas:
+        left = made.latex.get(str(formula.name)) or sympy.latex(formula.name)
+        right = sympy.latex(formula.expression, symbol_names=names)
         lines += [f"% {formula.says}", r"\begin{equation*}", f"  {left} = {right}", r"\end{equation*}"]
     return "\n".join(lines) + "\n"
 
 
-def to_mapping(form: SimplifiedForm) -> dict[str, Any]:
+def to_mapping(made: Derivation) -> dict[str, Any]:
     """Return an object of texts that SymPy can read back."""
     return {
         "schema": SCHEMA,
         "version": __version__,
-        "method": "simplified",
-        "quantity": "claimed",
-        "description": title(form),
-        "agents": form.agents,
-        "step": form.step,
-        "symbols": ["mu", *map(str, form.symbols)],
+        **made.facts,
+        "description": made.title,
         "formulas": [
-            {"key": f.key, "says": f.says, "name": str(f.name), "expression": str(f.expression)} for f in formulas(form)
+            {"key": f.key, "says": f.says, "name": str(f.name), "expression": str(f.expression)} for f in made.formulas
         ],
     }
 
 
-def _priors(form: SimplifiedForm) -> dict[sympy.Symbol, str]:
-    return {name: _latex_name(str(name), form.step) for name, _ in form.chain}
+def _latex_names(step: int) -> dict[str, str]:
+    derivative = {f"dP_{step}_dmu": rf"\frac{{\mathrm{{d}}P({step})}}{{\mathrm{{d}}\mu}}"}
+    return {f"P_{k}": f"P({k})" for k in range(1, step + 1)} | derivative
 
 
-def _latex_name(key: str, step: int) -> str:
-    if key.endswith("_prior"):
-        k = int(key.split("_")[1])
-        return f"P({k}|{k - 1})"
-    if key.startswith("P_"):
-        return f"P({key[2:]})"
-    if key == "derivative":
-        return rf"\frac{{\mathrm{{d}}P({step})}}{{\mathrm{{d}}\mu}}"
-    return f"P({step})" if key in ("closed", "series_at_0", "series_at_1") else ""
+def _latex_prior(key: str) -> str:
+    k = int(key.split("_")[1])
+    return f"P({k}|{k - 1})"
