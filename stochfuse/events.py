@@ -1,7 +1,7 @@
 """What may arrive in a step, and how likely: the events of (44)–(46).
 
-A step draws independent events: every ordered pair of agents in an ad hoc network, every sender in a broadcast one, every
-agent's one link in a cyclic one.  An event succeeds with probability µ, and everyone it concerns then hears the
+A step draws independent events: every ordered pair of agents in an ad hoc network, every sender in a broadcast one,
+every agent's one link in a cyclic one.  An event succeeds with probability µ, and everyone it concerns then hears the
 sender, at once or after a delay that is drawn with it.  Sets of agents are masks, bit i for agent i.
 
 With equal µ everywhere, an outcome with c successes of L events has probability µ^c (1−µ)^(L−c): the `Counts` and
@@ -144,15 +144,15 @@ class Counts(_Polynomial):
         """Weight of the start."""
         return 1
 
-    def factor(self, event: Event, fate: Fate) -> int:
+    def factor(self, event: Event, fate: Fate) -> Any:
         """Shift of one event's fate."""
         return 0 if fate.delay is None else self.bits
 
-    def both(self, a: int, b: int) -> int:
+    def both(self, a: Any, b: Any) -> Any:
         """Shift of two events together."""
         return a + b
 
-    def none(self) -> int:
+    def none(self) -> Any:
         """Shift of no event."""
         return 0
 
@@ -160,16 +160,16 @@ class Counts(_Polynomial):
         """Weight after an outcome."""
         return weight << factor
 
-    def table(self, weights: Sequence[int], degree: int) -> np.ndarray:
+    def table(self, weights: Sequence[Any], degree: int) -> np.ndarray:
         """Numbers of outcomes by number of successes, shape (weights, degree + 1)."""
         return np.array(self.exactly(weights, degree), dtype=float)
 
-    def exactly(self, weights: Sequence[int], degree: int) -> list[list[int]]:
+    def exactly(self, weights: Sequence[Any], degree: int) -> list[list[int]]:
         """Return the same as integers."""
         mask = (1 << self.bits) - 1
         return [[w >> c * self.bits & mask for c in range(degree + 1)] for w in weights]
 
-    def factors(self, factors: Sequence[int], degree: int) -> np.ndarray:
+    def factors(self, factors: Sequence[Any], degree: int) -> np.ndarray:
         """Outcomes' factors as coefficients, shape (factors, degree + 1)."""
         return np.eye(degree + 1)[[factor // self.bits for factor in factors]]
 
@@ -194,7 +194,7 @@ class Coefficients(_Polynomial):
 
     times = both
 
-    def table(self, weights: Sequence[np.ndarray], degree: int) -> np.ndarray:
+    def table(self, weights: Sequence[Any], degree: int) -> np.ndarray:
         """Coefficients, shape (weights, degree + 1)."""
         return np.array(weights)
 
@@ -225,7 +225,7 @@ class Rows:
     times = both
     product = both
 
-    def table(self, weights: Sequence[np.ndarray], degree: int) -> np.ndarray:
+    def table(self, weights: Sequence[Any], degree: int) -> np.ndarray:
         """Probabilities, shape (weights, rows)."""
         return np.array(weights)
 
@@ -268,7 +268,7 @@ def outcomes(drawn: Sequence[Event], agents: int, delay: Sequence[float], left: 
     for event in drawn:
         options = [(fate, weights.factor(event, fate)) for fate in choices]
         if isinstance(weights, Rows):
-            options = [(fate, factor) for fate, factor in options if factor.any()]
+            options = [(fate, factor) for fate, factor in options if np.any(factor)]
         whole = [
             Outcome(
                 _heard(outcome.heard, event, fate),

@@ -97,7 +97,8 @@ def _messages(check: Checker, path: str, entry: Any, agents: int, steps: int) ->
             check.note(f"{path}.{key}", "a whole number", "nothing")
     to = entry.get("to")
     receivers = to if isinstance(to, list) else [] if to is None else [to]
-    sent, arrives = entry.get("sent"), entry.get("arrives", entry.get("sent"))
+    sent: Any = entry.get("sent")
+    arrives: Any = entry.get("arrives", sent)
     for key, value, most in (
         ("from", entry.get("from"), agents),
         *(("to", receiver, agents) for receiver in receivers),

@@ -2,8 +2,8 @@
 
     (49)  E[P(k)] = Σ_S µ_S µ_¬S P_S(k)        (48)  E[x̂(k)] = Σ_S µ_S µ_¬S x̂_S(k)
 
-over the outcomes S of "which messages arrive, in all steps up to k", (45)/(46).  P_S and x̂_S are what the Local Fusion Graph
-claims in that outcome (or naive fusion, (42)/(43), with its estimator).  With one µ for all links,
+over the outcomes S of "which messages arrive, in all steps up to k", (45)/(46).  P_S and x̂_S are what the Local
+Fusion Graph claims in that outcome (or naive fusion, (42)/(43), with its estimator).  With one µ for all links,
 
     E[P(k)](µ) = Σ_c A_c µ^c (1−µ)^(L−c)
 
@@ -37,6 +37,8 @@ from stochfuse.metrics import Metric
 from stochfuse.network import LinkRows
 from stochfuse.scenario import Scenario
 
+MOST_PROBABILITIES = 20_000_000
+"""Probabilities that a distribution may hold at a time."""
 ESTIMATORS = {"local-fusion-graph": LocalFusionGraph, "naive": NaiveFusion}
 
 
@@ -83,7 +85,8 @@ class Outcomes:
         """
         if not self.polynomial:
             raise UsageError(
-                "a polynomial in µ: expected one link probability for all links and steps, and every outcome; got links "
+                "a polynomial in µ: expected one link probability for all links and steps, and every outcome; got "
+                "links "
                 "that differ, or outcomes left out"
             )
         return self.expectations[step - 1][group].P
@@ -147,18 +150,30 @@ class Outcomes:
             return metric.of(np.average(self.derivative()[:, :, groups], axis=2, weights=share))
         columns = []
         for step in range(1, len(self.structure.endings) + 1):
-            spread = self.distribution(metric, step, groups)
-            of = {
-                "variance": spread.variance,
-                "std": lambda spread=spread: np.sqrt(spread.variance()),
-                "quantile": lambda spread=spread: spread.quantile(number),
-                "at-most": lambda spread=spread: spread.at_most(number),
-            }
-            columns.append(of[kind]())
+            parts = []
+            for rows in self._blocks_of_rows(step):
+                spread = self.distribution(metric, step, groups, rows)
+                of = {
+                    "variance": spread.variance,
+                    "std": lambda spread=spread: np.sqrt(spread.variance()),
+                    "quantile": lambda spread=spread: spread.quantile(number),
+                    "at-most": lambda spread=spread: spread.at_most(number),
+                }
+                parts.append(of[kind]())
+            columns.append(np.concatenate(parts))
         return np.stack(columns, axis=1)
 
-    def distribution(self, metric: Metric, step: int, groups: Sequence[int] = (0,)) -> Distribution:
-        """Values of a metric over all outcomes of a step, with their probabilities in every row.
+    def _blocks_of_rows(self, step: int) -> list[slice]:
+        """Rows in blocks small enough that a distribution of each fits in memory."""
+        views, rows = self.structure.endings[step - 1].views, len(self.rows.link)
+        values = sum(len(view.ids) * len(view.terms[0][1]) for view in views)
+        size = max(1, MOST_PROBABILITIES // values)
+        return [slice(first, first + size) for first in range(0, rows, size)]
+
+    def distribution(
+        self, metric: Metric, step: int, groups: Sequence[int] = (0,), rows: slice = slice(None)
+    ) -> Distribution:
+        """Values of a metric over all outcomes of a step, with their probabilities in some rows (default: every one).
 
         Several groups of agents: of an agent picked at random.
         """
@@ -170,17 +185,19 @@ class Outcomes:
             if not shares:
                 continue
             value = metric.of(estimate.P)
-            before = self._probability(ending.weights[states])
-            cells = np.repeat(self._probability(view.factors), np.diff([*view.starts, value.shape[1]]), axis=1)
-            last = sum(part * self._probability(share[None]) for share, part in shares)
+            before = self._probability(ending.weights[states], rows)
+            cells = np.repeat(self._probability(view.factors, rows), np.diff([*view.starts, value.shape[1]]), axis=1)
+            last = sum(part * self._probability(share[None], rows) for share, part in shares)
             values.append(value.ravel())
             weights.append((before[:, :, None] * (cells * last)[:, None, :]).reshape(len(before), -1))
         found = Distribution.merged(np.concatenate(values), np.concatenate(weights, axis=1))
         return Distribution(found.values, found.probability / found.probability.sum(axis=1, keepdims=True))
 
-    def _probability(self, table: np.ndarray) -> np.ndarray:
+    def _probability(self, table: np.ndarray, rows: slice) -> np.ndarray:
         """Probabilities (rows, entries) of entries given on the weights' axis."""
-        return monomials(table.shape[1] - 1, self.rows.link) @ table.T if self.polynomial else table.T
+        if self.polynomial:
+            return monomials(table.shape[1] - 1, self.rows.link[rows]) @ table.T
+        return table.T[rows]
 
     def _at(self, expected: np.ndarray, link: np.ndarray | None) -> np.ndarray:
         if not self.polynomial:
@@ -330,5 +347,6 @@ def parse_statistic(name: str) -> tuple[str, float]:
         if np.isfinite(number) and (kind == "at-most" or 0 <= number <= 1):
             return kind, number
     raise UsageError(
-        f"statistic: expected mean, variance, std, quantile:P with P from 0 to 1, at-most:LIMIT or derivative, got '{name}'"
+        f"statistic: expected mean, variance, std, quantile:P with P from 0 to 1, at-most:LIMIT or "
+        f"derivative, got '{name}'"
     )

@@ -165,8 +165,8 @@ def evaluate(ledger: Ledger, sources: Sources) -> Information:
                     "expected an invertible model.F, or a model.Q that fills what it leaves out"
                 ) from None
         for atom in np.flatnonzero(~prior & (atom_step == step)):
-            given = sources.starts[of[atom]] if kinds[atom] == START else sources.measured(step, of[atom])
-            atoms[atom] = _packed(given)
+            source = int(of[atom])
+            atoms[atom] = _packed(sources.starts[source] if kinds[atom] == START else sources.measured(step, source))
         here = np.flatnonzero(value_step == step)
         terms = [ledger.sums[value] for value in here]
         which, times = np.array([pair for sum_ in terms for pair in sum_], dtype=int).T
@@ -213,6 +213,7 @@ def check_definite(Y: np.ndarray, step: int) -> None:
         fine = False
     if not fine:
         raise NoAnswerError(
-            f"at step {step} the information claimed in some outcome is not positive definite: what is taken for common "
+            f"at step {step} the information claimed in some outcome is not positive definite: what is taken for "
+            f"common "
             "exceeds what is known, and no covariance follows"
         )

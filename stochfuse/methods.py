@@ -46,7 +46,7 @@ class Settings:
 
 def predict(
     scenario: Scenario,
-    link: Sequence[float] | np.ndarray | float | None = None,
+    link: Sequence[float] | np.ndarray | float | LinkRows | None = None,
     method: str = "simplified",
     quantity: str = "claimed",
     *,
@@ -60,7 +60,8 @@ def predict(
     scenario : from `load_scenario`.
     link : link probabilities, one row of the result each; an array of shape (rows, agents, agents) gives a matrix µ_ij
         (receiver, sender) per row.  Default: the scenario's cases, else its link, else 0, 0.25, 0.5, 0.75 and 1.
-    method : "simplified": thesis (50)–(54), approximate (mean field); "general": thesis (44)–(49), exact, every outcome with
+    method : "simplified": thesis (50)–(54), approximate (mean field); "general": thesis (44)–(49), exact, every
+        outcome with
         its common information found by the Local Fusion Graph; "naive": the same with naive fusion (42)/(43);
         "monte-carlo": sampled.
     quantity : "claimed": the covariance that the fusion rule itself reports.

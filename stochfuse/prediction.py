@@ -92,8 +92,8 @@ class Prediction:
 
         Parameters
         ----------
-        name : "mean", "variance", "std", "quantile:P", "at-most:LIMIT" (the probability that the metric is at most that)
-            or "derivative" (of the expected metric in the link probability).
+        name : "mean", "variance", "std", "quantile:P", "at-most:LIMIT" (the probability that the metric is at most
+            that) or "derivative" (of the expected metric in the link probability).
         of : the metric; except for "mean", of the covariance in each outcome.
         agent : as in `values`; "mean" is an agent picked at random.
 

@@ -1,6 +1,7 @@
 """Monte Carlo for a scenario: the sample, its means, and how far they can be trusted.
 
-Standard errors are those of the mean over independent runs.  Agents that are alike are averaged within a run first; their
+Standard errors are those of the mean over independent runs.  Agents that are alike are averaged within a run first;
+their
 errors are dependent, the runs are not.  For a metric that is not linear in the covariance the error is carried through
 by the metric's derivative at the mean (delta method), taken by central differences.
 """
@@ -44,7 +45,7 @@ class Sampled:
     @property
     def runs(self) -> int:
         """Runs per row."""
-        return self.sample.index.shape[1]
+        return self.sample.which.shape[1]
 
     def covariance(self) -> np.ndarray:
         """Mean covariance per group, (rows, steps, groups, d, d)."""

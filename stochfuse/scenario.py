@@ -16,7 +16,7 @@ from __future__ import annotations
 import copy
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -78,9 +78,25 @@ class Scenario:
 
         return _build(mapping, name, structure_problems(mapping))
 
+    def until(self, step: int) -> Scenario:
+        """Return the same up to an earlier step."""
+        network = replace(
+            self.network,
+            steps=step,
+            link=None if self.network.link is None else _first(self.network.link, step),
+            cases=tuple((name, _first(link, step)) for name, link in self.network.cases),
+        )
+        source = dict(self.source)
+        source["network"] = {**source.get("network", {}), "steps": step}
+        return replace(self, network=network, source=source)
+
     def to_mapping(self) -> dict[str, Any]:
         """Return the mapping that the scenario was made from, with a file's keys."""
         return {"schema": SCHEMA, **copy.deepcopy(dict(self.source))}
+
+
+def _first(link: np.ndarray, steps: int) -> np.ndarray:
+    return link[:steps] if link.ndim in (1, 3) else link
 
 
 def preset_names() -> list[str]:
@@ -126,6 +142,8 @@ def link_rows(scenario: Scenario, link: Any = None) -> LinkRows:
         If they are no probabilities or do not fit the agents.
     """
     network, check = scenario.network, Checker()
+    if isinstance(link, LinkRows):
+        return link
     if link is None:
         return default_rows(network)
     expected = f"link probabilities, or one {network.agents}×{network.agents} matrix of them per row"

@@ -90,7 +90,7 @@ class GeneralForm:
         return sympy.Add(*(sympy.factor(w.as_expr()) * P for w, P in self.terms), evaluate=False)
 
     def polynomial(self) -> sympy.Poly:
-        """E[P(step)] as a polynomial in µ; its coefficients are rational numbers, or rational functions of the symbols."""
+        """E[P(step)] as a polynomial in µ with rational coefficients, or coefficients rational in the symbols."""
         if self.symbols:
             collected = sympy.Add(*(w.as_expr() * P for w, P in self.terms))
             return sympy.Poly(collected, MU)
@@ -150,7 +150,7 @@ class GeneralForm:
                         known[c] += a
         return ledger, found, ending.events
 
-    def _share(self, share: float) -> sympy.Rational:
+    def _share(self, share: float) -> Any:
         return sympy.Rational(round(share * self.agents), self.agents)
 
     @cached_property
@@ -161,7 +161,8 @@ class GeneralForm:
         if len(found) > most:
             instead = "give numbers for q, r and p0, or fewer agents or steps" if self.symbols else "give fewer steps"
             raise UsageError(
-                f"step {self.step} of {self.agents} agents has {len(found)} different covariances, too many for a closed "
+                f"step {self.step} of {self.agents} agents has {len(found)} different covariances, too many for a "
+                f"closed "
                 f"form: {instead}, or use `stochfuse predict --method general`"
             )
         generators = self.symbols or (sympy.Symbol("unused"),)

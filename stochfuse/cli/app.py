@@ -10,7 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from stochfuse import __version__
-from stochfuse.cli import derive, graph, predict, scenario
+from stochfuse.cli import compare, crosscheck, derive, graph, predict, reproduce, scenario
 from stochfuse.errors import NoAnswerError, ScenarioError, StochfuseError, UsageError
 
 EXIT_FAILURE, EXIT_USAGE, EXIT_NO_ANSWER, EXIT_INTERRUPTED = 1, 2, 3, 130
@@ -63,6 +63,9 @@ app = typer.Typer(
 app.command("predict")(predict.predict)
 app.command("derive")(derive.derive)
 app.command("graph")(graph.graph)
+app.command("compare")(compare.compare)
+app.command("crosscheck")(crosscheck.crosscheck)
+app.command("reproduce")(reproduce.reproduce)
 app.add_typer(scenario.app, name="scenario")
 
 

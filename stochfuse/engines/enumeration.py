@@ -1,8 +1,9 @@
 """Enumeration: every outcome of "which messages arrive", its probability (45)/(46), and what is claimed then.
 
-The structure comes first and knows no numbers: states of the estimator are carried from exchange to exchange with the weight
-of all outcomes that lead to them, and states that will behave alike are one.  The last two exchanges are not
-carried out state by state.  After the exchange at step k − 1 agent i knows what the agents that it heard, S_i, know together, and so
+The structure comes first and knows no numbers: states of the estimator are carried from exchange to exchange with the
+weight of all outcomes that lead to them, and states that will behave alike are one.  The last two exchanges are not
+carried out state by state.  After the exchange at step k − 1 agent i knows what the agents that it heard, S_i, know
+together, and so
 what agents i ∈ A have in common after it is ∩ ∪_{j∈S_i} (pedigree of j): one of the few elements of a
 distributive lattice on n generators (18 for n = 3) instead of one for each of the 2^(n(n−1)) outcomes.  Then
 
@@ -214,7 +215,8 @@ def _check_size(expected: int, drawn: list[Event], options: int, number: int, st
     instead = "use --method optimal or --method monte-carlo, fewer steps or fewer agents"
     if options ** len(drawn) > MOST_CELLS >> 4:
         raise TooManyError(
-            f"one exchange of {request.agents} agents has {options ** len(drawn):.3g} outcomes, the whole {number:.3g}, "
+            f"one exchange of {request.agents} agents has {options ** len(drawn):.3g} outcomes, the whole "
+            f"{number:.3g}, "
             f"too many to list: {instead}"
         )
     if expected > request.most and not request.prune:
@@ -405,7 +407,8 @@ def expectation(ending: Ending, values: Information, weights: Weights, groups: i
     Returns
     -------
     list of Estimate
-        P of shape (width, d, d): coefficients A_c of the polynomial in µ, or one matrix per row; x (width, d, 1) or None.
+        P of shape (width, d, d): coefficients A_c of the polynomial in µ, or one matrix per row; x (width, d, 1) or
+        None.
     """
     sums: list[list[Any]] = [[None, None] for _ in range(groups)]
     for view, states, estimate in claimed(ending, values):

@@ -1,6 +1,7 @@
 """Monte Carlo: draw the events, evaluate the estimator, average.  The cross-check; it imports no other engine.
 
-Runs with equal histories are evaluated once: at every step runs are gathered by (state, what arrived), and states that will
+Runs with equal histories are evaluated once: at every step runs are gathered by (state, what arrived), and states
+that will
 behave alike are taken together while that saves work.  Random numbers are drawn in blocks, each with its own seed, so
 that the sample depends on the seed alone and not on the number of workers.
 """
@@ -59,11 +60,11 @@ class Sample(NamedTuple):
     Parameters
     ----------
     values : (values, d, d) different covariances.
-    index : (rows, runs, steps, agents) which of them each agent claims.
+    which : (rows, runs, steps, agents) which of them each agent claims.
     """
 
     values: np.ndarray
-    index: np.ndarray
+    which: np.ndarray
 
 
 def sample(
@@ -186,7 +187,7 @@ class _Histories:
         return np.array([[x.fused(i, h) for i, h in enumerate(heard)] for x, heard, _ in self.each], np.int32)
 
     def merged(self) -> tuple[list[Exchange], np.ndarray, np.ndarray]:
-        """Next exchanges of the different states, number of each pair's, and where its agents moved, (pairs, agents)."""
+        """Next exchanges of the different states, each pair's number, and where its agents moved, (pairs, agents)."""
         states: dict[Any, int] = {}
         after, moved = np.empty(len(self.each), dtype=np.int64), np.empty((len(self.each), self.agents), dtype=np.int64)
         for pair, (exchange, heard, late) in enumerate(self.each):

@@ -4,7 +4,7 @@ Nodes are local estimates.  The parents of node (i, k+1) are (i, k) and every no
 comes with its whole pedigree.  What a pedigree, a set D of nodes closed under ancestors, is worth at the step t of its
 latest node:
 
-    fuse(D) = Σ over non-empty T ⊆ max(D) of (−1)^(|T|+1) · [ fuse(∩ anc(s), s ∈ T) brought forward to t ]        (1)–(3)
+    fuse(D) = Σ over non-empty T ⊆ max(D) of (−1)^(|T|+1) · [ fuse(∩ anc(s), s ∈ T) brought forward to t ]
 
 where max(D) are the nodes of D without a descendant in D and fuse of one node's pedigree is that node's information.
 This is the six-step search of section 2.4 with the three valuation rules of appendix A: one common node is brought
@@ -12,8 +12,8 @@ forward; several of one step are fused there and then brought forward; several o
 latest one's step, fused, and brought forward.  Agent i's fused estimate is fuse of everything that it knows.  Delayed
 and out-of-order messages need nothing new.
 
-Departures from the source.  The search is written on pedigrees (bit masks) instead of the pointers of figures 6–15; equal
-intersections are counted together before anything is evaluated, which is how (19) becomes (20).
+Departures from the source.  The search is written on pedigrees (bit masks) instead of the pointers of figures 6–15;
+equal intersections are counted together before anything is evaluated, which is how (19) becomes (20).
 
 Which states behave alike.  A later search only meets nodes that are maximal in an intersection of two or more
 pedigrees: of agents, of messages under way, or of nodes met before.  (The maximal elements of a union of pedigrees are
@@ -60,7 +60,8 @@ class Pedigrees:
     ----------
     ledger : where values are written.
     values : value of each node.
-    below : pedigree of each node, itself included, as a mask; every ancestor has a smaller number, and steps never fall.
+    below : pedigree of each node, itself included, as a mask; every ancestor has a smaller number, and steps never
+        fall.
     older : pedigrees that have the first nodes in common with these, so that what is known of them holds here.
     """
 

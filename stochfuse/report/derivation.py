@@ -66,7 +66,8 @@ _SYMBOLS = "mu: link probability, q, r: process and measurement noise variance, 
 def _simplified_title(form: SimplifiedForm) -> str:
     start = "shared" if form.shared else "independent"
     return (
-        f"Simplified formulation (54), {_agents(form.agents)}, scalar state with F = G = H = 1, {start} initial estimates: "
+        f"Simplified formulation (54), {_agents(form.agents)}, scalar state with F = G = H = 1, {start} "
+        f"initial estimates: "
         f"expected claimed posterior covariance P_k after step k (approximate: mean field). {_SYMBOLS}"
     )
 
@@ -75,7 +76,8 @@ def _general_title(form: GeneralForm) -> str:
     start = "shared" if form.shared else "independent"
     what = "naive fusion (42)/(43)" if form.estimator == "naive" else "the Local Fusion Graph"
     return (
-        f"General formulation (49) of {what}, {_agents(form.agents)}, {form.architecture}, scalar state with F = G = H = "
+        f"General formulation (49) of {what}, {_agents(form.agents)}, {form.architecture}, scalar state with "
+        f"F = G = H = "
         f"1, {start} initial estimates: expected claimed posterior covariance P_k after step k (exact: every outcome). "
         f"{_SYMBOLS}"
     )

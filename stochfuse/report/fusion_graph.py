@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from stochfuse import __version__
-from stochfuse.errors import StochfuseError
 from stochfuse.fusion_graph import Explanation, FusionGraph, Node, Term
 from stochfuse.report.export import write_file
+from stochfuse.report.plot import figure_class
 from stochfuse.report.table import number
 
 SCHEMA = "stochfuse.fusion-graph/1"
@@ -95,9 +95,9 @@ def _term(term: Term) -> dict[str, Any]:
     }
 
 
-def _edges(graph: FusionGraph, shown: set[Node], agent: int, step: int) -> list[tuple[Node, Node, bool]]:
+def _edges(graph: FusionGraph, shown: set[Node], agent: int, step: int) -> list[tuple[Any, Any, bool]]:
     """(parent, child, late) among the nodes shown; the fused estimate is the node (agent, step + ½)."""
-    edges = [(p, n, p[1] < n[1] - 1) for n in shown for p in graph.parents(n)]
+    edges: list[tuple[Any, Any, bool]] = [(p, n, p[1] < n[1] - 1) for n in shown for p in graph.parents(n)]
     fused = (agent, step + 0.5)
     edges += [(p, fused, p[1] < step) for p in graph.received(agent, step)]
     return sorted(edges, key=lambda e: (e[1][1], e[1][0], e[0][1], e[0][0]))
@@ -111,7 +111,7 @@ def _roles(graph: FusionGraph, explanation: Explanation) -> tuple[set[Node], set
 
 
 def to_dot(graph: FusionGraph, explanation: Explanation) -> str:
-    """One agent's graph at a step for Graphviz: parents above, one rank per step, late messages dashed, common nodes filled."""
+    """One agent's graph at a step for Graphviz: one rank per step, late messages dashed, common nodes filled."""
     shown, removed = _roles(graph, explanation)
     agent, step = explanation.agent, explanation.step
     lines = [
@@ -141,12 +141,10 @@ def _id(node: Node) -> str:
 
 def draw(graph: FusionGraph, explanation: Explanation):
     """Return a figure of one agent's graph at a step: agents as rows, steps as columns, as in the thesis' figure 5."""
-    try:
-        from matplotlib.figure import Figure
-        from matplotlib.lines import Line2D
-        from matplotlib.patches import Patch
-    except ImportError:
-        raise StochfuseError("figures need matplotlib: pip install 'stochfuse[plot]'") from None
+    Figure = figure_class()
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
     shown, removed = _roles(graph, explanation)
     agent, step, n = explanation.agent, explanation.step, graph.history.agents
     figure = Figure(figsize=(max(5.0, 1.9 * step + 2.2), max(3.2, 1.05 * n + 1.6)), layout="constrained")

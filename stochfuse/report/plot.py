@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from textwrap import wrap
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from stochfuse.report.export import write_file
 from stochfuse.report.predictions import View
 
 MOST_CURVES = 8
-_MARKERS = "osD^vP*X"
+MARKERS = "osD^vP*X"
 
 
 def plot_prediction(view: View, output: Path) -> None:
@@ -27,49 +28,75 @@ def plot_prediction(view: View, output: Path) -> None:
     write_file(output, lambda path: figure.savefig(path, dpi=150))
 
 
-def draw(view: View):
-    """Return the figure, not shown and not registered with pyplot."""
+def figure_class() -> Any:
+    """Return matplotlib's Figure.
+
+    Raises
+    ------
+    StochfuseError
+        If matplotlib is not installed.
+    """
     try:
         from matplotlib.figure import Figure
-        from matplotlib.ticker import MaxNLocator
     except ImportError:
         raise StochfuseError("plots need matplotlib: pip install 'stochfuse[plot]'") from None
+    return Figure
+
+
+def draw(view: View):
+    """Return the figure, not shown and not registered with pyplot."""
+    Figure = figure_class()
+    from matplotlib.ticker import MaxNLocator
+
     p, values = view.prediction, view.values()
+    order = np.argsort(p.link)
     figure = Figure(figsize=(7.5, 5.0), layout="constrained")
     axes = figure.add_subplot()
     if p.cases is None and len(p.link) > 1:
-        chosen = _spread(len(p.steps))
-        order = np.argsort(p.link)
+        chosen = spread(len(p.steps))
         curves = [(f"k = {p.steps[i]}", p.link[order], values[order, i]) for i in chosen]
         axes.set_xlabel("link probability µ")
         legend = "step" if len(chosen) == len(p.steps) else f"step ({len(chosen)} of {len(p.steps)})"
     else:
-        chosen = _spread(len(p.link))
+        chosen = spread(len(p.link))
         names = p.cases or [f"mean µ = {µ:.3g}" for µ in p.link]
         curves = [(names[i], p.steps, values[i]) for i in chosen]
         axes.set_xlabel("step k")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         legend = "links" if len(chosen) == len(p.link) else f"links ({len(chosen)} of {len(p.link)})"
-    _draw_curves(axes, curves)
+    errors = view.errors()
+    bars: list[Any] = [None] * len(curves)
+    if errors is not None:
+        against_link = p.cases is None and len(p.link) > 1
+        bars = [1.96 * (errors[order, i] if against_link else errors[i]) for i in chosen]
+    _draw_curves(axes, curves, bars)
     short = view.metric.label.partition(" (")[0]
-    axes.set_ylabel(short + (f" [{view.unit}]" if view.unit else ", relative to µ = 0" if view.baseline else ""))
-    axes.set_ylim(bottom=0)
+    if view.statistic == "mean":
+        axes.set_ylabel(short + (f" [{view.unit}]" if view.unit else ", relative to µ = 0" if view.baseline else ""))
+    else:
+        axes.set_ylabel("\n".join(wrap(view.what.partition(": ")[2], 60)))
+    if values.min() >= 0:
+        axes.set_ylim(bottom=0)
     axes.grid(alpha=0.3)
     axes.legend(title=legend, fontsize="small")
     figure.suptitle("\n".join(wrap(view.what, 80)), fontsize="medium")
-    axes.set_title(f"{view.whom}\n{view.how}", fontsize="small")
+    axes.set_title(
+        "\n".join([view.whom, *wrap(view.how + ("; bars: 95 % confidence" if errors is not None else ""), 100)]),
+        fontsize="small",
+    )
     return figure
 
 
-def _draw_curves(axes, curves: list[tuple[str, np.ndarray, np.ndarray]]) -> None:
+def _draw_curves(axes, curves: list[tuple[str, np.ndarray, np.ndarray]], bars: list[Any]) -> None:
     from matplotlib import colormaps
 
     colors = colormaps["viridis"](np.linspace(0, 0.9, len(curves)))
     for i, (label, x, y) in enumerate(curves):
         few = len(x) <= 30
-        axes.plot(x, y, color=colors[i], label=label, marker=_MARKERS[i % len(_MARKERS)] if few else None, markersize=4)
+        marker = MARKERS[i % len(MARKERS)] if few else None
+        axes.errorbar(x, y, bars[i], color=colors[i], label=label, marker=marker, markersize=4, capsize=2)
 
 
-def _spread(n: int) -> list[int]:
+def spread(n: int) -> list[int]:
     """At most `MOST_CURVES` indices out of n, first and last included."""
     return sorted({round(i) for i in np.linspace(0, n - 1, min(n, MOST_CURVES))})

@@ -1,0 +1,113 @@
+"""`stochfuse compare`: methods side by side, with the differences."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from stochfuse.cli.options import (
+    AgentOption,
+    AgentsOption,
+    ArchitectureOption,
+    DigitsOption,
+    Estimator,
+    EstimatorOption,
+    Format,
+    FormatOption,
+    LinkOption,
+    MaxGraphsOption,
+    MetricOption,
+    OutputOption,
+    P0Option,
+    PlotOption,
+    PruneOption,
+    QOption,
+    ROption,
+    RunsOption,
+    ScenarioArgument,
+    SeedOption,
+    StepsOption,
+    WorkersOption,
+    check_files,
+    chosen_format,
+    load,
+)
+
+
+def compare(
+    scenario: ScenarioArgument = "thesis-transient",
+    methods: Annotated[
+        str, typer.Option(metavar="LIST", help="Methods to compare: simplified, general, naive, monte-carlo.")
+    ] = "general,simplified,naive,monte-carlo",
+    reference: Annotated[
+        str | None, typer.Option(metavar="METHOD", help="What the others are compared with; default: the most exact.")
+    ] = None,
+    agents: AgentsOption = None,
+    steps: StepsOption = None,
+    link: LinkOption = None,
+    q: QOption = None,
+    r: ROption = None,
+    p0: P0Option = None,
+    architecture: ArchitectureOption = None,
+    estimator: EstimatorOption = Estimator.local_fusion_graph,
+    metric: MetricOption = None,
+    agent: AgentOption = "mean",
+    relative: Annotated[bool, typer.Option("--relative", help="Differences in per cent of the reference.")] = False,
+    max_graphs: MaxGraphsOption = 100_000,
+    prune: PruneOption = False,
+    runs: RunsOption = 1000,
+    seed: SeedOption = 1,
+    workers: WorkersOption = None,
+    digits: DigitsOption = 5,
+    format: FormatOption = None,
+    output: OutputOption = None,
+    plot: PlotOption = None,
+) -> None:
+    """Show what methods predict side by side, and the signed differences.
+
+    simplified is approximate, general and naive are exact averages over every outcome (naive of a rule that counts
+    shared information twice), monte-carlo is sampled, with its standard error.
+    """
+    from stochfuse.cli.progress import shown
+    from stochfuse.comparison import compare as run
+    from stochfuse.metrics import metric as metric_of
+    from stochfuse.report import comparisons, table
+    from stochfuse.report.export import terminal_width, to_json, write_text
+    from stochfuse.report.predictions import View
+
+    check_files(output, plot)
+    given, links = load(scenario, agents, steps, architecture, q, r, p0, link)
+    chosen = metric_of(metric or given.metric or "trace", given.model)
+    with shown() as progress:
+        found = run(
+            given,
+            links,
+            [name.strip() for name in methods.split(",")],
+            reference,
+            estimator=estimator.value,
+            max_graphs=max_graphs,
+            prune=prune,
+            runs=runs,
+            seed=seed,
+            workers=workers,
+            progress=progress,
+        )
+    whose = int(agent) if agent.isdigit() else agent
+    view = comparisons.ComparisonView(
+        found, tuple(View(p, chosen, whose, None, digits) for p in found.predictions), relative
+    )
+    view.values()
+    for prediction in found.predictions:
+        for note in prediction.notes:
+            typer.echo(f"note: {prediction.method}: {note}", err=True)
+    if plot is not None:
+        comparisons.plot_comparison(view, plot)
+    kind = chosen_format(format, output)
+    if kind == Format.csv.value:
+        text = comparisons.compare_csv(view)
+    elif kind == Format.json.value:
+        text = to_json(comparisons.compare_json(view))
+    else:
+        text = table.render(comparisons.compare_table(view), kind, terminal_width())
+    write_text(text, output)

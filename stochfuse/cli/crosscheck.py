@@ -1,0 +1,162 @@
+"""`stochfuse crosscheck`: a simulator's results against the prediction, with a verdict."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from stochfuse.cli.options import (
+    AgentsOption,
+    ArchitectureOption,
+    DigitsOption,
+    Format,
+    FormatOption,
+    MaxGraphsOption,
+    MetricOption,
+    OutputOption,
+    P0Option,
+    PruneOption,
+    QOption,
+    ROption,
+    ScenarioArgument,
+    StepsOption,
+    check_files,
+    chosen_format,
+    load,
+)
+
+if TYPE_CHECKING:
+    from stochfuse.crosscheck import Results
+    from stochfuse.network import LinkRows
+    from stochfuse.scenario import Scenario
+
+
+class Against(StrEnum):
+    """What results can be checked against."""
+
+    general = "general"
+    simplified = "simplified"
+    naive = "naive"
+
+
+def crosscheck(
+    file: Annotated[
+        str,
+        typer.Argument(
+            metavar="FILE",
+            help="CSV or JSON, - for standard input: columns run, agent, step, link, covariance and optionally "
+            "error; or means: agent, step, link, covariance, count, std.",
+        ),
+    ],
+    scenario: ScenarioArgument = "thesis-transient",
+    agents: AgentsOption = None,
+    steps: StepsOption = None,
+    q: QOption = None,
+    r: ROption = None,
+    p0: P0Option = None,
+    architecture: ArchitectureOption = None,
+    method: Annotated[Against, typer.Option(help="Prediction to check against; simplified is approximate.")] = (
+        Against.general
+    ),
+    metric: MetricOption = None,
+    alpha: Annotated[
+        float, typer.Option(help="Probability that a right simulator is called wrong, over all cells together.")
+    ] = 0.001,
+    max_graphs: MaxGraphsOption = 100_000,
+    prune: PruneOption = False,
+    digits: DigitsOption = 5,
+    format: FormatOption = None,
+    output: OutputOption = None,
+) -> None:
+    """Compare a simulator's results with the prediction; exit 0 if they agree, 1 if they do not.
+
+    The column covariance holds the claimed covariance after fusion, as the metric says (default: trace). Per cell a
+    z-score; the verdict corrects for the number of cells.
+    """
+    from stochfuse.crosscheck import crosscheck as check
+    from stochfuse.crosscheck import read_results
+    from stochfuse.errors import UsageError
+    from stochfuse.metrics import metric as metric_of
+    from stochfuse.report import crosschecks, table
+    from stochfuse.report.export import terminal_width, to_json, write_text
+    from stochfuse.report.predictions import View
+
+    check_files(output, None)
+    if not 0 < alpha < 1:
+        raise UsageError(f"--alpha: expected a probability between 0 and 1, got {alpha:g}")
+    if file == scenario == "-":
+        raise UsageError("FILE and SCENARIO: expected at most one of them on standard input, got - for both")
+    results = read_results(file)
+    last = int(results.step.max())
+    given, _ = load(scenario, agents, steps, architecture, q, r, p0, None)
+    if last > given.network.steps:
+        raise UsageError(
+            f"{results.at(int(results.step.argmax()))}, column 'step': expected at most the scenario's "
+            f"{given.network.steps} steps, got {last}; see --steps"
+        )
+    given = given.until(last)
+    chosen = metric_of(metric or given.metric or "trace", given.model)
+    prediction = _predict(given, _rows(results, given), method, max_graphs, prune)
+    verdict = check(results, prediction, chosen, alpha)
+    shown = crosschecks.CrosscheckView(results, View(prediction, chosen, "mean", None, digits), verdict)
+    for note in prediction.notes:
+        typer.echo(f"note: {note}", err=True)
+    if method is Against.simplified:
+        typer.echo("note: the simplified formulation is approximate: a right simulator differs from it", err=True)
+    for link, ratio in verdict.consistency.items():
+        where = f" at µ = {link}" if link else ""
+        typer.echo(
+            f"note: column error{where}: mean squared error is {ratio:.3g} times the mean claimed covariance (not "
+            f"part of "
+            "the verdict)",
+            err=True,
+        )
+    kind = chosen_format(format, output)
+    if kind == Format.csv.value:
+        text = crosschecks.crosscheck_csv(shown)
+    elif kind == Format.json.value:
+        text = to_json(crosschecks.crosscheck_json(shown))
+    else:
+        text = table.render(crosschecks.crosscheck_table(shown), kind, terminal_width())
+    write_text(text, output)
+    if not verdict.agrees:
+        typer.echo("the results disagree with the prediction", err=True)
+        raise typer.Exit(1)
+
+
+def _rows(results: Results, scenario: Scenario) -> LinkRows:
+    """Rows of the prediction for the file's link probabilities or names of cases."""
+    from stochfuse.crosscheck import ResultsError
+    from stochfuse.network import stacked_rows
+    from stochfuse.scenario import link_rows
+
+    links, cases = results.links, dict(scenario.network.cases)
+    if links == [""]:
+        rows = link_rows(scenario)
+        if len(rows.link) > 1:
+            raise ResultsError(f"{results.source}: expected a column 'link', since the scenario has no link of its own")
+        return rows
+    if all(link in cases for link in links):
+        return stacked_rows(tuple(links), [cases[link] for link in links], scenario.network)
+    values = []
+    for link in links:
+        try:
+            value = float(link)
+        except ValueError:
+            value = -1.0
+        if not 0 <= value <= 1:
+            where = results.at(int((results.link == link).argmax()))
+            known = f", or a case ({', '.join(cases)})" if cases else ""
+            raise ResultsError(f"{where}, column 'link': expected a probability between 0 and 1{known}, got '{link}'")
+        values.append(value)
+    return link_rows(scenario, values)
+
+
+def _predict(scenario: Scenario, rows: LinkRows, method: Against, max_graphs: int, prune: bool):
+    from stochfuse.cli.progress import shown
+    from stochfuse.methods import predict
+
+    with shown() as progress:
+        return predict(scenario, rows, method.value, max_graphs=max_graphs, prune=prune, progress=progress)
