@@ -20,8 +20,8 @@ from stochfuse.errors import ScenarioError, UsageError
 from stochfuse.estimators import Late
 from stochfuse.estimators.local_fusion_graph import LocalFusionGraph, Pedigrees
 from stochfuse.general import sources_of
-from stochfuse.information import Ledger, evaluate
-from stochfuse.kalman import from_information
+from stochfuse.information import Ledger, check_definite, evaluate
+from stochfuse.kalman import Estimate, from_information
 from stochfuse.scenario import Scenario, parse, read_file
 
 SCHEMA = "stochfuse.history/1"
@@ -241,22 +241,43 @@ class FusionGraph:
         fused = self._latest(self._union(at_hand))
         return Explanation(agent, step, fused, tuple(n for n in at_hand if n not in fused), self._terms(fused, step))
 
-    def covariances(self, scenario: Scenario) -> dict[Node, np.ndarray]:
-        """Claimed covariance of every agent's fused estimate at every step, with a scenario's model and sensors.
+    def estimates(self, scenario: Scenario, measurements: Any = None) -> dict[Node, Estimate]:
+        """Every agent's fused estimate at every step, with a scenario's model, sensors and first estimates.
+
+        Parameters
+        ----------
+        measurements : (steps, agents, p) what each agent measured, or None for covariances alone; the entry of step 1 is
+            not used.
+
+        Returns
+        -------
+        dict
+            (agent, step) → Estimate with P (d, d) as claimed, and x (d, 1) or None.
 
         Raises
         ------
         UsageError
-            If the scenario has other numbers of agents or too few steps.
+            If the scenario or the measurements have other numbers of agents or too few steps.
+        NoAnswerError
+            If the graph claims information that is not positive definite, which it can in several dimensions.
         """
-        if scenario.network.agents != self.history.agents or scenario.network.steps < self.history.steps:
+        n, steps = self.history.agents, self.history.steps
+        if scenario.network.agents != n or scenario.network.steps < steps:
             raise UsageError(
-                f"scenario: expected {self.history.agents} agents and at least {self.history.steps} steps, got "
-                f"{scenario.network.agents} and {scenario.network.steps}"
+                f"scenario: expected {n} agents and at least {steps} steps, got {scenario.network.agents} and "
+                f"{scenario.network.steps}"
             )
-        values = evaluate(self.ledger, sources_of(scenario, by_agent=True))
-        P = from_information(values).P
-        return {node: P[value] for node, value in self._fused.items()}
+        records = None if measurements is None else np.asarray(measurements, dtype=float)
+        if records is not None and (records.ndim != 3 or records.shape[0] < steps or records.shape[1] != n):
+            raise UsageError(
+                f"measurements: expected shape (steps, agents, p) = ({steps}, {n}, p), got {records.shape}"
+            )
+        values = evaluate(self.ledger, sources_of(scenario, records, by_agent=True))
+        for (_, step), value in self._fused.items():
+            check_definite(values.Y[value], step)
+        found = from_information(values)
+        x = found.x
+        return {node: Estimate(None if x is None else x[value], found.P[value]) for node, value in self._fused.items()}
 
     def _terms(self, nodes: Sequence[Node], step: int) -> tuple[Term, ...]:
         below = self.pedigrees.below

@@ -287,7 +287,7 @@ BAD = [
     (["derive", "--latex", "--format", "json"], "error: --latex and --format: expected one of them, got both"),
     (["derive", "--agents", "100000"], "error: agents: expected 1 to 100 for formulas, got 100000"),
     (["derive", "--q", "abc"], "error: q: expected a number, got 'abc'"),
-    (["derive", "general"], "Invalid value for"),
+    (["derive", "guess"], "Invalid value for"),
     (["scenario", "check", "nothing.toml"], "no such file"),
     (["nonsense"], "No such command 'nonsense'"),
 ]

@@ -257,3 +257,80 @@ def expected_by_enumeration(
                 P[k - 1, i] += probability * network.covariance(i, k)
                 x[k - 1, i] += probability * network.state(i, k)
     return P, x
+
+
+def _full_rate(F, Q, sensors, P0, x0, records, fuse):
+    """Fused (x, P) of every agent and step; fuse(j, k, locals, priors, fused) gives (y, Y) of agent j."""
+    n, steps = len(sensors), len(records)
+    fused, local = {}, {}
+
+    def forward(x, P, steps):
+        for _ in range(steps):
+            x, P = F @ x, kalman_predict(P, F, Q)
+        return x, P
+
+    for k in range(1, steps + 1):
+        prior = {}
+        for i in range(n):
+            if k == 1:
+                local[i, k] = (x0, P0)
+                continue
+            prior[i] = forward(*fused[i, k - 1], 1)
+            x, P = prior[i]
+            H, R = sensors[i]
+            local[i, k] = (kalman_state(x, P, H, R, records[k - 1][i]), kalman_update(P, H, R))
+        for j in range(n):
+            y, Y = fuse(j, k, local, prior, fused, forward)
+            P = np.linalg.inv(Y)
+            fused[j, k] = (P @ y, P)
+    return fused
+
+
+def _information(x, P):
+    return np.linalg.inv(P) @ x, np.linalg.inv(P)
+
+
+def _sum(pairs):
+    return sum(y for y, _ in pairs), sum(Y for _, Y in pairs)
+
+
+def full_rate_broadcast(F, Q, sensors, P0, x0, records):
+    """(28)–(31): everyone's local estimates less the priors of all others."""
+    n = len(sensors)
+
+    def fuse(j, k, local, prior, fused, forward):
+        y, Y = _sum([_information(*local[i, k]) for i in range(n)])
+        if k > 1:
+            b, B = _sum([_information(*prior[i]) for i in range(n) if i != j])
+            y, Y = y - b, Y - B
+        return y, Y
+
+    return _full_rate(F, Q, sensors, P0, x0, records, fuse)
+
+
+def full_rate_cyclic(F, Q, sensors, P0, x0, records):
+    """(32)–(38), with the inverse that (37) omits."""
+    n = len(sensors)
+
+    def fuse(j, k, local, prior, fused, forward):
+        nxt = (j + 1) % n
+        y, Y = _sum([_information(*local[i, k]) for i in (j, nxt)])
+        if k == 1:
+            return y, Y
+        if k == 2:
+            b, B = _information(*forward(*local[nxt, 1], 1))  # (32)/(33)
+        else:
+            parts = [_information(*local[nxt, k - 1]), _information(*forward(*local[j, k - 2], 1))]
+            b, B = _sum(parts)  # (34)/(35)
+            if k > 3:  # (36)–(38)
+                c, C = _information(*forward(*fused[j, k - 3], 2))
+                b, B = b - c, B - C
+            P = np.linalg.inv(B)
+            b, B = _information(*forward(P @ b, P, 1))
+        return y - b, Y - B
+
+    return _full_rate(F, Q, sensors, P0, x0, records, fuse)
+
+
+def full_rate_stand_alone(F, Q, sensors, P0, x0, records):
+    return _full_rate(F, Q, sensors, P0, x0, records, lambda j, k, local, *_: _information(*local[j, k]))

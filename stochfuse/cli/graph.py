@@ -61,7 +61,7 @@ def graph(
         from stochfuse.scenario import load_scenario
 
         given = load_scenario(scenario, agents=made.history.agents, steps=made.history.steps)
-        traces = {node: float(np.trace(P)) for node, P in made.covariances(given).items()}
+        traces = {node: float(np.trace(estimate.P)) for node, estimate in made.estimates(given).items()}
     if plot is not None:
         report.plot(made, explanations[0], plot)
     if format is GraphFormat.json:

@@ -21,7 +21,7 @@ import numpy as np
 from stochfuse.engines import uncollected
 from stochfuse.estimators import Estimator, Exchange, Late
 from stochfuse.events import Event
-from stochfuse.information import Ledger, Sources, evaluate
+from stochfuse.information import Ledger, Sources, check_definite, evaluate
 from stochfuse.kalman import from_information
 
 BLOCK = 1000
@@ -150,6 +150,8 @@ def _run_blocks(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tu
                 exchanges, exchange_of = histories.onward(), history_of
     used, index = np.unique(claimed, return_inverse=True)
     information = evaluate(ledger, experiment.sources)
+    for step in range(1, len(experiment.events) + 1):
+        check_definite(information.Y[np.unique(claimed[:, step - 1])], step)
     P = from_information(information._replace(Y=information.Y[used])).P
     return P, index.reshape(claimed.shape).astype(np.int32)
 
