@@ -231,6 +231,7 @@ def histories(n, steps, architecture, link, delay=(1.0,)):
             draws += [(k, j, tuple(i for i in range(n) if i != j)) for j in range(n)]
         else:
             draws += [(k, (i + 1) % n, (i,)) for i in range(n)]
+    draws = [(k, j, receivers) for k, j, receivers in draws if receivers and link[k - 1][receivers[0]][j] > 0]
     fates = [None, *range(len(delay))]
     for choice in product(fates, repeat=len(draws)):
         probability, history = 1.0, [set() for _ in range(steps)]
