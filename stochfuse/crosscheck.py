@@ -452,12 +452,11 @@ def _together(cells: Sequence[Cell], samples: Sequence[tuple[np.ndarray, np.ndar
     if len(runs) <= 4 * len(varying):
         return 0.0, 0
     X = np.stack([samples[i][1][np.searchsorted(samples[i][0], runs)] for i in varying], axis=1)
-    deviation = X.std(axis=0, ddof=1)
-    keep = deviation > 0
-    if not keep.any():
+    seen = X.std(axis=0) > ROUNDING * np.abs(X.mean(axis=0))  # what did not vary says nothing about correlation
+    if not seen.any():
         return 0.0, 0
-    z = (X.mean(axis=0) - [cells[i].expected for i in varying])[keep] / deviation[keep] * sqrt(len(runs))
-    values, vectors = np.linalg.eigh(np.corrcoef(X[:, keep], rowvar=False).reshape(len(z), len(z)))
+    z = np.array([cells[i].z for i in varying])[seen]
+    values, vectors = np.linalg.eigh(np.corrcoef(X[:, seen], rowvar=False).reshape(len(z), len(z)))
     # directions that hardly vary are rounding
     firm = values > 1e-6
     components = (vectors.T @ z)[firm] / np.sqrt(values[firm])

@@ -48,10 +48,7 @@ def networks(draw):
 def test_merging_states_changes_no_later_answer(scenario, estimator):
     rows = link_rows(scenario)
     merged, plain = (outcomes(scenario, rows, estimator, plain=p) for p in (False, True))
-    expected, got = plain.covariance(), merged.covariance()
-    for g, agents in enumerate(merged.groups):
-        for agent in agents:
-            np.testing.assert_allclose(got[:, :, g], expected[:, :, plain.groups.index((agent,))], rtol=1e-12)
+    np.testing.assert_allclose(merged.covariance(), plain.covariance(), rtol=1e-12)
 
 
 def test_merged_graphs_are_few():
@@ -232,15 +229,16 @@ def test_work_is_announced_before_it_starts():
 
 def test_too_many_graphs_are_refused_with_the_alternatives():
     message = (
-        r"1.68e\+07 outcomes make about \d+ different graphs by step 3, more than --max-graphs 20: raise it, leave the least "
+        r"1.68e\+07 outcomes make about 270 different graphs by step 3, more than --max-graphs 20: raise it, leave the least "
         "likely out with --prune, or use .*--method monte-carlo"
     )
     with pytest.raises(sf.UsageError, match=message):
         sf.predict(sf.load_scenario(steps=4), [0.5], method="general", max_graphs=20)
-    with pytest.raises(sf.UsageError, match=r"one exchange of 6 agents has 1.07e\+09 outcomes"):
-        sf.predict(sf.load_scenario(agents=6, steps=3), [0.5], method="general")
-    with pytest.raises(sf.UsageError, match="two exchanges of 6 agents have more outcomes than can be listed"):
-        sf.predict(sf.load_scenario(agents=6, steps=2), [0.5], method="general")
+    for agents, steps, number in ((6, 2, r"1.07e\+09"), (5, 3, r"1.05e\+06"), (9, 3, r"4.72e\+21")):
+        with pytest.raises(
+            sf.UsageError, match=f"one exchange of {agents} agents has {number} outcomes, .*too many to list"
+        ):
+            sf.predict(sf.load_scenario(agents=agents, steps=steps), [0.5], method="general")
 
 
 def test_pruning_reports_what_was_left_out():

@@ -155,7 +155,7 @@ def _enumerate(estimator: Estimator, request: Request, progress: Progress) -> St
             endings.append(_two_step_ending(estimator, layer, before, last, degree, total, step, request))
         if step < steps or not two_steps:
             left = steps - step + 1
-            expected = _expected(sizes, len(layer) * number[step - 1] // number[step - 2])
+            expected = _expected(sizes, len(layer) * number[step - 1] // number[step - 2], len(estimator.relabellings))
             _check_size(expected, before, len(fates(request.delay, left)), number[steps], step, request)
             if not announced and expected > LONG:
                 progress.expect(number[steps], _extrapolated(sizes, expected, steps - step - two_steps))
@@ -201,10 +201,11 @@ def _likeliest(layer: dict[Any, np.ndarray], most: int) -> dict[Any, np.ndarray]
     return {state: layer[state] for state in order[:most]}
 
 
-def _expected(sizes: list[int], candidates: int) -> int:
-    """Return how many states the next layer will have, judged by the growth so far."""
-    growth = sizes[-1] / sizes[-2] if len(sizes) > 1 else candidates
-    return int(min(candidates, 1.2 * growth * sizes[-1]))
+def _expected(sizes: list[int], candidates: int, relabellings: int) -> int:
+    """Return how many states the next layer will have, judged by the growth so far, at first by the symmetry."""
+    if len(sizes) == 1:
+        return min(candidates, 1 + 3 * candidates // (2 * relabellings))
+    return int(min(candidates, 1.2 * sizes[-1] * sizes[-1] / sizes[-2]))
 
 
 def _extrapolated(sizes: list[int], expected: int, further: int) -> int:
@@ -265,14 +266,16 @@ def _two_step_ending(
     weights, n = request.weights, request.agents
     table = _Table(estimator, n)
     views = []
-    for fused, shares in _last_heard(last, request).items():
-        members = [i for i in range(n) if fused >> i & 1]
+    sets = _last_heard(last, request)
+    most = max(len(concerning(before, _members(fused, n))) for fused in sets)
+    if most > MOST_CELLS.bit_length() - 1:
+        raise TooManyError(
+            f"one exchange of {n} agents has {2.0**most:.3g} outcomes, too many to list: use --method optimal or --method "
+            "monte-carlo, or fewer agents"
+        )
+    for fused, shares in sets.items():
+        members = _members(fused, n)
         concerned = concerning(before, members)
-        if len(concerned) > MOST_CELLS.bit_length() - 1:
-            raise TooManyError(
-                f"two exchanges of {n} agents have more outcomes than can be listed: use --method optimal or --method "
-                "monte-carlo, or fewer agents"
-            )
         heard, factor_of, factors = _cells(concerned, members, weights)
         order = np.argsort(factor_of, kind="stable")
         starts = np.searchsorted(factor_of[order], np.arange(len(factors)))
@@ -285,6 +288,10 @@ def _two_step_ending(
     ids = np.array([table.values(estimator.exchange(state)) for state in layer])
     made = [View(ids, tuple((s, i) for s, i in terms if i is not None), *rest) for terms, *rest in views]
     return Ending(step, weights.table(list(layer.values()), degree), made, events)
+
+
+def _members(agents: int, n: int) -> list[int]:
+    return [i for i in range(n) if agents >> i & 1]
 
 
 def _last_heard(last: list[Event], request: Request) -> dict[int, list[Any]]:

@@ -56,11 +56,13 @@ class Estimator(Protocol):
     ledger : where values are written.
     sources : source (of start and measurements) of every agent.
     removes : whether anything is taken for common and removed.
+    relabellings : permutations of the agents that leave network and sources as they are.
     """
 
     ledger: Ledger
     sources: tuple[int, ...]
     removes: bool
+    relabellings: Sequence[tuple[int, ...]]
 
     def start(self) -> Any:
         """State before the first exchange."""
