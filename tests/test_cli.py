@@ -403,3 +403,143 @@ def test_import_of_the_package_is_light():
         assert getattr(sf, name) is not None
     with pytest.raises(AttributeError, match="module 'stochfuse' has no attribute 'nothing'"):
         _ = sf.nothing  # type: ignore[attr-defined]
+
+
+def test_general_method_says_what_it_shows():
+    done = run("predict", "--method", "general", "--steps", "3", "--link", "0.5")
+    assert "general formulation (49) of the Local Fusion Graph; exact, 262,144 outcomes" in done.stdout
+    assert "0.5   58.333   29.835   25.521" in done.stdout
+    assert done.stderr == "note: 262,144 outcomes; about 15 different graphs to carry\n"
+    naive = run("predict", "--method", "naive", "--steps", "2", "--link", "1").stdout
+    assert "general formulation (49) of naive fusion (42)/(43); exact, 4,096 outcomes" in naive
+    assert "12.281" in naive
+
+
+def test_statistics_over_the_outcomes():
+    def shown(name, *more):
+        wide = {"COLUMNS": "200"}
+        arguments = ("predict", "--method", "general", "--steps", "2", "--link", "0.5", "--statistic", name, *more)
+        return run(*arguments, env=wide).stdout
+
+    assert "probability that the variance of x is at most 30" in shown("at-most:30")
+    assert "0.9-quantile over the outcomes of the variance of x" in shown("quantile:0.9")
+    assert "derivative in µ of the expected variance of x" in shown("derivative")
+    assert "standard deviation over the outcomes of the variance of x" in shown("std")
+    record = next(csv.DictReader(io.StringIO(shown("at-most:60", "--format", "csv"))))
+    assert (record["metric"], record["value"]) == ("at-most:60(trace)", "0.75")
+    result = strict_json(shown("variance", "--format", "json"))
+    assert result["statistic"] == "variance"
+    assert "bernstein" not in result
+
+
+def test_json_of_the_general_method_has_the_polynomial():
+    result = strict_json(
+        run("predict", "--method", "general", "--steps", "2", "--link", "0.3", "--format", "json").stdout
+    )
+    A = result["bernstein"][1]
+    assert len(A) == 13
+    assert sum(a * 0.3**c * 0.7 ** (12 - c) for c, a in enumerate(A)) == pytest.approx(
+        result["values"][0][1], rel=1e-13
+    )
+    assert result["meta"]["nature"] == "exact"
+    assert result["meta"]["outcomes"] == 4096
+
+
+def test_monte_carlo_shows_its_error():
+    arguments = ("predict", "--method", "monte-carlo", "--link", "0.5", "--steps", "2", "--runs", "400", "--seed", "5")
+    table = run(*arguments).stdout
+    assert "sampled, 400 runs, seed 5; ± one standard error" in table.replace("\n", " ")
+    assert " ±" in table.splitlines()[-1]
+    (_, row) = csv.DictReader(io.StringIO(run(*arguments, "--format", "csv").stdout))
+    result = strict_json(run(*arguments, "--format", "json").stdout)
+    assert float(row["standard_error"]) == result["standard_error"][0][1] > 0
+    low, high = result["interval"]["low"][0][1], result["interval"]["high"][0][1]
+    assert low < result["values"][0][1] < high
+    assert high - low == pytest.approx(2 * 1.96 * result["standard_error"][0][1], rel=1e-4)
+
+
+def test_compare(tmp_path):
+    done = run("compare", "--steps", "2", "--link", "0.25,0.75", "--runs", "100", "--plot", str(tmp_path / "c.png"))
+    assert "Δ: difference from general, signed" in done.stdout
+    assert "0.25   2    39.379       42.571   +3.19" in done.stdout
+    assert max(map(len, done.stdout.splitlines())) <= 80
+    assert (tmp_path / "c.png").stat().st_size > 10_000
+    result = strict_json(run("compare", "--steps", "2", "--methods", "simplified,naive", "--format", "json").stdout)
+    assert (result["reference"], list(result["methods"])) == ("simplified", ["simplified", "naive"])
+
+
+def test_crosscheck_verdict_is_the_exit_code(tmp_path):
+    rows = ["run,step,link,covariance", *(f"{r},1,1,33.3333333333\n{r},2,1,21.2121212121" for r in range(20))]
+    (tmp_path / "good.csv").write_text("\n".join(rows))
+    done = run("crosscheck", str(tmp_path / "good.csv"))
+    assert "AGREE (largest |z| over 2 cells" in done.stdout.replace("\n", " ")
+    (tmp_path / "bad.csv").write_text("\n".join(rows).replace("21.21", "21.61"))
+    done = run("crosscheck", str(tmp_path / "bad.csv"), "--format", "json", code=1)
+    assert strict_json(done.stdout)["verdict"] == "disagree"
+    assert done.stderr.endswith("the results disagree with the prediction\n")
+    done = run("crosscheck", str(tmp_path / "good.csv"), "--steps", "1", code=2)
+    assert "line 3, column 'step': expected at most the scenario's 1 steps, got 2; see --steps" in done.stderr
+    done = run("crosscheck", "-", code=2, input="run,step,link,covariance\n1,1,1.5,3\n")
+    assert "line 2, column 'link': expected a probability between 0 and 1, got '1.5'" in done.stderr
+    run("crosscheck", "-", "-", code=2, input="")
+
+
+def test_crosscheck_by_case(tmp_path):
+    (tmp_path / "s.toml").write_text(
+        "model = {F = 1, H = 1, Q = 25, R = 100}\ninitial = {P = 100}\n"
+        "[network]\nagents = 2\nsteps = 2\n[[network.case]]\nname = 'full'\nlink = 1\n[[network.case]]\nname = 'none'\nlink = 0\n"
+    )
+    text = "run,step,link,covariance\n" + "".join(f"{r},1,none,100\n{r},1,full,50\n" for r in range(3))
+    (tmp_path / "r.csv").write_text(text)
+    assert "AGREE" in run("crosscheck", str(tmp_path / "r.csv"), str(tmp_path / "s.toml")).stdout
+    (tmp_path / "r.csv").write_text(text.replace("none", "nine"))
+    done = run("crosscheck", str(tmp_path / "r.csv"), str(tmp_path / "s.toml"), code=2)
+    assert "expected a probability between 0 and 1, or a case (full, none), got 'nine'" in done.stderr
+
+
+def test_graph(tmp_path):
+    text = run("graph", "--agent", "3", "--step", "4", "--scenario", "thesis-transient").stdout
+    assert text.startswith("agent 3 at step 4 fuses {(2,k4), (3,k4)}\n")
+    assert "claimed covariance, trace: 23.229" in text
+    assert run("graph", "--agent", "3", "--step", "4", "--format", "dot").stdout.startswith(
+        'digraph "agent 3 at step 4" {'
+    )
+    assert len(strict_json(run("graph", "--format", "json").stdout)["fusions"]) == 12
+    run("graph", "--agent", "1", "--step", "4", "--plot", str(tmp_path / "g.svg"))
+    assert "<svg" in (tmp_path / "g.svg").read_text()
+    assert "expected --agent and --step" in run("graph", "--format", "dot", code=2).stderr
+    assert "agent: expected a whole number from 1 to 3, got 4" in run("graph", "--agent", "4", code=2).stderr
+
+
+def test_derive_general():
+    text = run("derive", "general", "--agents", "2", "--step", "2", "--q", "25", "--r", "100", "--p0", "100").stdout
+    assert "P_2 = -20*mu**3/9 + 120*mu**2/7 - 850*mu/21 + 500/9" in text
+    assert strict_json(run("derive", "naive", "--step", "1", "--format", "json").stdout)["method"] == "naive"
+
+
+def test_reproduce_timing():
+    rows = strict_json(run("reproduce", "timing", "--format", "json").stdout)["rows"]
+    assert [row["thesis_s"] for row in rows] == [12_000, 2, None]
+    assert all(row["here_s"] > 0 for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["predict", "--steady", "--method", "general"], "steady: expected method simplified, got general"),
+        (["predict", "--statistic", "std"], "--statistic std: expected --method general or naive, got simplified"),
+        (["predict", "--method", "general", "--statistic", "mode"], "statistic: expected mean, variance, std, quantile:P"),
+        (["predict", "--method", "general", "--statistic", "quantile:2"], "statistic: expected mean, variance, std, quantile:P"),
+        (["predict", "cv-2d", "--method", "general", "--steps", "2", "--statistic", "derivative"], "derivative: expected metric trace or var:STATE, got 'rms:x,y'"),
+        (["predict", "--method", "general", "--steps", "9"], "more than --max-graphs 100000"),
+        (["predict", "--method", "monte-carlo", "--runs", "1"], "Invalid value for '--runs'"),
+        (["compare", "--methods", "simplified,guess"], "methods: expected one of simplified, general, naive, monte-carlo, got 'guess'"),
+        (["crosscheck", "nowhere.csv"], "nowhere.csv: no such file"),
+        (["graph", "nowhere.toml"], "no such file, and no history of that name (known: thesis-example)"),
+        (["derive", "general", "--step", "3"], "too many for a closed form"),
+    ],
+)  # fmt: skip
+def test_bad_requests_to_the_general_formulation(arguments, message):
+    done = run(*arguments, code=2)
+    assert message in done.stderr
+    assert done.stdout == ""

@@ -25,6 +25,29 @@ def test_simplified_formulation_of_the_thesis_scenario(link, architecture):
         assert f"{value:.{digits}f}" == printed
 
 
+TABLE_49 = {
+    ("ad-hoc", 0.25): ("77.08333", "39.37944", "31.68171", "29.9007"),
+    ("ad-hoc", 0.5): ("58.33333", "29.83547", "25.52113", "24.81763"),
+    ("ad-hoc", 0.75): ("43.75", "24.51826", "21.96258", "21.51761"),
+    ("broadcast", 0.25): ("77.08333", "39.70478", "32.05569", "30.22397", "29.84359"),
+    ("broadcast", 0.5): ("58.33333", "30.31415", "25.81867", "25.01889", "24.89674"),
+    ("broadcast", 0.75): ("43.75", "24.72526", "22.0427", "21.58531", "21.50537"),
+    ("cyclic", 0.25): ("87.5", "46.13638", "36.64332", "33.92131", "33.17008"),
+    ("cyclic", 0.5): ("75", "38.08235", "30.76495", "29.21189", "28.98359"),
+    ("cyclic", 0.75): ("62.5", "31.34155", "26.62183", "25.9707", "25.88323"),
+    ("cyclic", 1.0): ("50", "25.86207", "23.95098", "23.6054", "23.42564"),
+}
+
+
+@pytest.mark.parametrize(("architecture", "link"), TABLE_49)
+def test_general_formulation_of_the_thesis_scenario(architecture, link):
+    printed = TABLE_49[architecture, link]
+    scenario = sf.load_scenario("thesis-transient", architecture=architecture, steps=len(printed))
+    values = sf.predict(scenario, [link], method="general").values()[0]
+    for value, text in zip(values, printed, strict=True):
+        assert value == pytest.approx(float(text), abs=5.1e-6)
+
+
 def test_two_scalar_filters_without_exchange():
     """F = Q = R = 1, P0 = 1: P = 2/3, 5/8, 13/21 after one, two, three updates."""
     source = {

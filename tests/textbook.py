@@ -158,7 +158,7 @@ class FusionGraph:
         return pair
 
     def info(self, nodes, t):
-        y, Y = 0.0, 0.0
+        y, Y = 0, 0
         for size in range(1, len(nodes) + 1):
             for T in combinations(sorted(nodes, key=str), size):
                 common = self.common(T, t)

@@ -108,6 +108,11 @@ def predict(
             raise UsageError(f"--statistic {statistic}: expected --method general or naive, got {method.value}")
         if normalise:
             raise UsageError("--normalise: expected --statistic mean")
+        from stochfuse.general import parse_statistic
+
+        kind, _ = parse_statistic(statistic)
+        if kind == "derivative" and not chosen.linear:
+            raise UsageError(f"derivative: expected metric trace or var:STATE, got '{chosen.name}'")
     settings: dict[str, Any] = {"steady": steady}
     if method is not Method.simplified:
         settings |= {

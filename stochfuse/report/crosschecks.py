@@ -76,7 +76,7 @@ def crosscheck_table(shown: CrosscheckView) -> Table:
     return Table(
         shown.titles,
         ("µ", "k", "agents"),
-        ("runs", "mean", "±", "expected", "z", "p corr.", "verdict"),
+        ("runs", "mean", "±", "expected", "z", "p corr."),
         tuple(rows),
     )
 
