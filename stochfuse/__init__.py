@@ -17,10 +17,16 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from stochfuse.comparison import Comparison as Comparison
+    from stochfuse.comparison import compare as compare
+    from stochfuse.crosscheck import check_results as check_results
+    from stochfuse.crosscheck import read_results as read_results
     from stochfuse.errors import NoAnswerError as NoAnswerError
     from stochfuse.errors import ScenarioError as ScenarioError
     from stochfuse.errors import StochfuseError as StochfuseError
     from stochfuse.errors import UsageError as UsageError
+    from stochfuse.fusion_graph import FusionGraph as FusionGraph
+    from stochfuse.fusion_graph import load_history as load_history
     from stochfuse.methods import predict as predict
     from stochfuse.prediction import Prediction as Prediction
     from stochfuse.questions import steady_state as steady_state
@@ -28,22 +34,32 @@ if TYPE_CHECKING:
     from stochfuse.scenario import load_scenario as load_scenario
     from stochfuse.states import predict_states as predict_states
     from stochfuse.symbolic import derive_simplified as derive_simplified
+    from stochfuse.symbolic_general import derive_general as derive_general
 
 _HOME = {
+    "Comparison": "comparison",
+    "FusionGraph": "fusion_graph",
     "NoAnswerError": "errors",
     "Prediction": "prediction",
     "Scenario": "scenario",
     "ScenarioError": "errors",
     "StochfuseError": "errors",
     "UsageError": "errors",
+    "compare": "comparison",
+    "check_results": "crosscheck",
+    "derive_general": "symbolic_general",
     "derive_simplified": "symbolic",
+    "load_history": "fusion_graph",
     "load_scenario": "scenario",
     "predict": "methods",
     "predict_states": "states",
+    "read_results": "crosscheck",
     "steady_state": "questions",
 }
 
 __all__ = [
+    "Comparison",
+    "FusionGraph",
     "NoAnswerError",
     "Prediction",
     "Scenario",
@@ -51,10 +67,15 @@ __all__ = [
     "StochfuseError",
     "UsageError",
     "__version__",
+    "check_results",
+    "compare",
+    "derive_general",
     "derive_simplified",
+    "load_history",
     "load_scenario",
     "predict",
     "predict_states",
+    "read_results",
     "steady_state",
 ]
 

@@ -308,7 +308,7 @@ def _check_different(results: Results) -> None:
         )
 
 
-def crosscheck(results: Results, prediction: Prediction, metric: Metric, alpha: float = ALPHA) -> Verdict:
+def check_results(results: Results, prediction: Prediction, metric: Metric, alpha: float = ALPHA) -> Verdict:
     """Compare a simulator's results with a prediction.
 
     Parameters

@@ -246,8 +246,8 @@ class FusionGraph:
 
         Parameters
         ----------
-        measurements : (steps, agents, p) what each agent measured, or None for covariances alone; the entry of step 1 is
-            not used.
+        measurements : (steps, agents, p) what each agent measured, or None for covariances alone; the entry of step 1
+            is not used.
 
         Returns
         -------

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import stochfuse as sf
-from stochfuse.crosscheck import Results, ResultsError, crosscheck, read_results
+from stochfuse.crosscheck import Results, ResultsError, check_results, read_results
 from stochfuse.metrics import metric
 
 LINKS = ["0", "0.25", "0.5", "0.75", "1"]
@@ -49,7 +49,7 @@ def results(P):
 
 
 def verdict(P, prediction, **kwargs):
-    return crosscheck(results(P), prediction, metric("trace", prediction.scenario.model), **kwargs)
+    return check_results(results(P), prediction, metric("trace", prediction.scenario.model), **kwargs)
 
 
 def test_honest_samples_pass(samples, prediction):
@@ -91,7 +91,7 @@ def test_rare_outcomes_that_were_not_seen_are_reckoned_with():
         "simulator", np.array(["0.999"] * 10), np.ones(10, int), np.zeros(10, int), np.full(10, 100 / 3), np.arange(10), None, None, None,
         np.arange(10), "line", 0.0,
     )  # fmt: skip
-    assert crosscheck(flat, prediction, metric("trace", prediction.scenario.model)).agrees
+    assert check_results(flat, prediction, metric("trace", prediction.scenario.model)).agrees
 
 
 def test_means(samples, prediction, tmp_path):
@@ -102,10 +102,10 @@ def test_means(samples, prediction, tmp_path):
     ]  # fmt: skip
     (tmp_path / "means.json").write_text(json.dumps(rows))
     m = metric("trace", prediction.scenario.model)
-    assert crosscheck(read_results(tmp_path / "means.json"), prediction, m).agrees
+    assert check_results(read_results(tmp_path / "means.json"), prediction, m).agrees
     rows[20]["covariance"] *= 1.05
     (tmp_path / "means.json").write_text(json.dumps({key: [row[key] for row in rows] for key in rows[0]}))
-    found = crosscheck(read_results(tmp_path / "means.json"), prediction, m)
+    found = check_results(read_results(tmp_path / "means.json"), prediction, m)
     assert not found.agrees
     assert [cell.agrees for cell in found.cells].count(False) == 1
 
@@ -115,15 +115,15 @@ def test_digits_of_the_file_are_no_error(tmp_path):
     m = metric("trace", prediction.scenario.model)
     text = "run,step,link,covariance\n" + "".join(f"{r},1,1,33.33\n{r},2,1,{{}}\n" for r in range(5))
     (tmp_path / "r.csv").write_text(text.format(*["21.21"] * 5))
-    assert crosscheck(read_results(tmp_path / "r.csv"), prediction, m).agrees
+    assert check_results(read_results(tmp_path / "r.csv"), prediction, m).agrees
     (tmp_path / "r.csv").write_text(text.format(*["21.30"] * 5))
-    assert not crosscheck(read_results(tmp_path / "r.csv"), prediction, m).agrees
+    assert not check_results(read_results(tmp_path / "r.csv"), prediction, m).agrees
 
 
 def test_errors_are_reported_as_consistency(tmp_path):
     prediction = sf.predict(sf.load_scenario(steps=1), [0.0], method="general")
     (tmp_path / "r.csv").write_text("run,step,link,covariance,error\n1,1,0,100,10\n2,1,0,100,\n3,1,0,100,-10\n")
-    found = crosscheck(read_results(tmp_path / "r.csv"), prediction, metric("trace", prediction.scenario.model))
+    found = check_results(read_results(tmp_path / "r.csv"), prediction, metric("trace", prediction.scenario.model))
     assert found.consistency == {"0": pytest.approx(1.0)}
 
 
@@ -163,13 +163,13 @@ def test_results_that_do_not_fit(prediction, tmp_path):
     m = metric("trace", prediction.scenario.model)
     (tmp_path / "r.csv").write_text(HEAD + "1,9,1,0,100\n2,9,1,0,100\n")
     with pytest.raises(ResultsError, match=r"line 2, column 'agent': expected 1 to 3, got 9"):
-        crosscheck(read_results(tmp_path / "r.csv"), prediction, m)
+        check_results(read_results(tmp_path / "r.csv"), prediction, m)
     (tmp_path / "r.csv").write_text(HEAD + "1,1,1,0,100\n")
     with pytest.raises(ResultsError, match="link 0, step 1: expected at least 2 runs, got 1"):
-        crosscheck(read_results(tmp_path / "r.csv"), prediction, m)
+        check_results(read_results(tmp_path / "r.csv"), prediction, m)
     (tmp_path / "r.csv").write_text("step,link,covariance,count\n1,0,100,50\n")
     simplified = sf.predict(sf.load_scenario(steps=STEPS), [0.0])
     with pytest.raises(ResultsError, match=r"line 2, column 'std': expected a number, since method simplified"):
-        crosscheck(read_results(tmp_path / "r.csv"), simplified, m)
+        check_results(read_results(tmp_path / "r.csv"), simplified, m)
     with pytest.raises(sf.UsageError, match="alpha: expected a probability between 0 and 1, got 2"):
-        crosscheck(read_results(tmp_path / "r.csv"), prediction, m, alpha=2)
+        check_results(read_results(tmp_path / "r.csv"), prediction, m, alpha=2)

@@ -14,6 +14,7 @@ from stochfuse.general import outcomes
 from stochfuse.metrics import metric
 from stochfuse.scenario import link_rows
 from tests import strategies, textbook
+from tests.benchmarks import literal
 
 
 @st.composite
@@ -49,6 +50,12 @@ def test_merging_states_changes_no_later_answer(scenario, estimator):
     rows = link_rows(scenario)
     merged, plain = (outcomes(scenario, rows, estimator, plain=p) for p in (False, True))
     np.testing.assert_allclose(merged.covariance(), plain.covariance(), rtol=1e-12)
+
+
+def test_against_the_benchmarks_plain_enumeration():
+    plain = literal.general(25.0, 100.0, 100.0, 3, 0.3, 2)
+    values = sf.predict(sf.load_scenario(steps=2), [0.3], method="general").values()[0]
+    np.testing.assert_allclose(values, plain, rtol=1e-13)
 
 
 def test_merged_graphs_are_few():

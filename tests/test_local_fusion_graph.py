@@ -75,7 +75,7 @@ def the_thesis(oracle):
 
 
 def test_worked_example_equations_7_to_20(example):
-    graph, estimates, oracle = example
+    _, estimates, oracle = example
     for (agent, step), (y, Y) in the_thesis(oracle).items():
         P = np.linalg.inv(Y)
         np.testing.assert_allclose(estimates[agent, step].P, P, rtol=1e-11)

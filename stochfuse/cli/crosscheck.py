@@ -75,8 +75,7 @@ def crosscheck(
     The column covariance holds the claimed covariance after fusion, as the metric says (default: trace). Per cell a
     z-score; the verdict corrects for the number of cells.
     """
-    from stochfuse.crosscheck import crosscheck as check
-    from stochfuse.crosscheck import read_results
+    from stochfuse.crosscheck import check_results, read_results
     from stochfuse.errors import UsageError
     from stochfuse.metrics import metric as metric_of
     from stochfuse.report import crosschecks, table
@@ -99,7 +98,7 @@ def crosscheck(
     given = given.until(last)
     chosen = metric_of(metric or given.metric or "trace", given.model)
     prediction = _predict(given, _rows(results, given), method, max_graphs, prune)
-    verdict = check(results, prediction, chosen, alpha)
+    verdict = check_results(results, prediction, chosen, alpha)
     shown = crosschecks.CrosscheckView(results, View(prediction, chosen, "mean", None, digits), verdict)
     for note in prediction.notes:
         typer.echo(f"note: {note}", err=True)

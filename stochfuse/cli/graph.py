@@ -47,7 +47,7 @@ def graph(
     from stochfuse.errors import UsageError
     from stochfuse.fusion_graph import FusionGraph, load_history
     from stochfuse.report import fusion_graph as report
-    from stochfuse.report.export import to_json, write_text
+    from stochfuse.report.export import terminal_width, to_json, write_text
 
     check_files(output, plot)
     made = FusionGraph(load_history(history), shared=shared)
@@ -69,5 +69,5 @@ def graph(
     elif format is GraphFormat.dot:
         text = report.to_dot(made, explanations[0])
     else:
-        text = report.to_text(explanations, traces)
+        text = report.to_text(explanations, traces, terminal_width())
     write_text(text, output)

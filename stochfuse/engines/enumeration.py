@@ -270,8 +270,8 @@ def _two_step_ending(
     most = max(len(concerning(before, _members(fused, n))) for fused in sets)
     if most > MOST_CELLS.bit_length() - 1:
         raise TooManyError(
-            f"one exchange of {n} agents has {2.0**most:.3g} outcomes, too many to list: use --method optimal or --method "
-            "monte-carlo, or fewer agents"
+            f"one exchange of {n} agents has {2.0**most:.3g} outcomes, too many to list: use --method optimal or "
+            "--method monte-carlo, or fewer agents"
         )
     for fused, shares in sets.items():
         members = _members(fused, n)

@@ -40,7 +40,7 @@ class CrosscheckView:
         """Lines that say what is compared with what."""
         return (
             f"Crosscheck of {self.results.source}: {self.says}",
-            f"expected: {self.view.what}",
+            f"against: {self.view.what}",
             self.view.whom.partition(";")[0],
             self.view.how,
             "±: standard error of the mean; p corr.: p-value times the number of cells",

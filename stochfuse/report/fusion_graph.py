@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +30,10 @@ def names(nodes: tuple[Node, ...]) -> str:
     return name(nodes[0]) if len(nodes) == 1 else "{" + ", ".join(map(name, nodes)) + "}"
 
 
-def to_text(explanations: list[Explanation], traces: Mapping[Node, float] | None = None) -> str:
-    """Every fusion in words, one block each."""
+def to_text(
+    explanations: list[Explanation], traces: Mapping[Node, float] | None = None, width: int | None = None
+) -> str:
+    """Every fusion in words, one block each, wrapped to a width."""
     blocks = []
     for e in explanations:
         lines = [f"agent {e.agent} at step {e.step} fuses {names(e.fused)}"]
@@ -38,8 +42,13 @@ def to_text(explanations: list[Explanation], traces: Mapping[Node, float] | None
         lines += _lines(e.terms, 2)
         if traces is not None:
             lines.append(f"  claimed covariance, trace: {number(traces[e.agent, e.step])}")
-        blocks.append("\n".join(lines))
+        blocks.append("\n".join(lines if width is None else map(partial(_wrapped, width=width), lines)))
     return "\n\n".join(blocks) + "\n"
+
+
+def _wrapped(line: str, width: int) -> str:
+    indent = " " * (len(line) - len(line.lstrip()) + 4)
+    return textwrap.fill(line, width, subsequent_indent=indent, break_long_words=False)
 
 
 def _lines(terms: tuple[Term, ...], indent: int) -> list[str]:

@@ -88,6 +88,39 @@ def accuracy() -> list[tuple[str, str]]:
     return rows
 
 
+def enumeration(steps: int) -> tuple[str, ...]:
+    scenario = sf.load_scenario(steps=steps)
+    start = time.perf_counter()
+    plain = literal.general(25.0, 100.0, 100.0, 3, 0.5, steps)
+    baseline = time.perf_counter() - start
+    (mine,) = medians(lambda: sf.predict(scenario, [0.5], "general"), rounds=5)
+    difference = np.abs(sf.predict(scenario, [0.5], "general").values()[0] / plain - 1).max()
+    name = f"three agents ad hoc, {steps} steps: merged against plain enumeration"
+    return name, f"{baseline:.4g} s", f"{mine:.4g} s", f"{baseline / mine:.0f}", "≥ 20", f"{difference:.0e}"
+
+
+def absolute(quick: bool) -> list[tuple[str, ...]]:
+    """Seconds of the cases that have a bound in seconds, each in a process of its own, and the memory it took."""
+    work = [
+        ("ad hoc, 4 steps", "steps=4", "'general'", "1 s"),
+        ("ad hoc, 5 steps (2^30 outcomes)", "steps=5", "'general'", "20 s, 2 GB"),
+        ("broadcast, 7 steps", "steps=7, architecture='broadcast'", "'general'", "20 s"),
+        ("cyclic, 7 steps", "steps=7, architecture='cyclic'", "'general'", "20 s"),
+        ("Monte Carlo, ad hoc, 5 steps, 50,000 runs", "", "'monte-carlo', runs=50_000, workers=2", "4 s"),
+    ]
+    rows = []
+    for name, scenario, method, bound in work[:1] if quick else work:
+        code = (
+            "import resource, time, stochfuse as sf; start = time.perf_counter(); "
+            f"sf.predict(sf.load_scenario({scenario}), [0.5], {method}).values(); "
+            "print(time.perf_counter() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3)"
+        )
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        seconds, megabytes = map(float, done.stdout.split())
+        rows.append((name, f"{seconds:.3g} s", f"{megabytes:.0f} MB", bound))
+    return rows
+
+
 def show(title: str, headings: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
     table = Table(*headings, title=title, title_justify="left")
     for row in rows:
@@ -115,6 +148,12 @@ def main() -> None:
     )
     rows = [many_agents("thesis-transient", rounds), many_agents("cv-2d", rounds)]
     show("Cost against the number of agents, 1001 µ × 5 steps", ("work", "few", "many", "ratio", "bound", ""), rows)
+    show(
+        "Enumeration against plain enumeration, in one run",
+        ("work", "plain", "stochfuse", "times faster", "bound", "largest relative difference"),
+        [enumeration(2 if quick else 3)],
+    )
+    show("Three agents, scalar, one µ: seconds here", ("work", "time", "memory", "bound"), absolute(quick))
     show(
         "Start-up, wall time", ("command", "bare app", "stochfuse", "ratio", "bound", ""), start_up(1 if quick else 21)
     )
