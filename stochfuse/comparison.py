@@ -14,7 +14,8 @@ from stochfuse.metrics import Metric
 from stochfuse.prediction import Prediction
 from stochfuse.scenario import Scenario
 
-EXACT_FIRST = ("general", "simplified", "naive", "monte-carlo")
+DEFAULT_METHODS = ("general", "simplified", "naive", "monte-carlo")
+EXACT_FIRST = ("general", "optimal", "simplified", "naive", "monte-carlo")
 """Which method the others are compared with, if it is not said."""
 
 
@@ -52,7 +53,7 @@ class Comparison:
 def compare(
     scenario: Scenario,
     link: Sequence[float] | np.ndarray | float | None = None,
-    methods: Sequence[str] = METHODS,
+    methods: Sequence[str] = DEFAULT_METHODS,
     reference: str | None = None,
     **settings: Any,
 ) -> Comparison:

@@ -14,7 +14,7 @@ from stochfuse.network import LinkRows
 from stochfuse.prediction import Prediction
 from stochfuse.scenario import Scenario, link_rows
 
-METHODS = ("simplified", "general", "naive", "monte-carlo")
+METHODS = ("simplified", "general", "optimal", "naive", "monte-carlo")
 QUANTITIES = ("claimed",)
 ESTIMATORS = ("local-fusion-graph", "naive")
 MOST_GRAPHS = 100_000
@@ -63,7 +63,8 @@ def predict(
     method : "simplified": thesis (50)–(54), approximate (mean field); "general": thesis (44)–(49), exact, every
         outcome with
         its common information found by the Local Fusion Graph; "naive": the same with naive fusion (42)/(43);
-        "monte-carlo": sampled.
+        "monte-carlo": sampled; "optimal": the best that any linear fusion could do with what arrived, exact, by the contact
+        chain (theory section 6).
     quantity : "claimed": the covariance that the fusion rule itself reports.
     steady : also solve for the steady state (simplified).
     **settings : see `Settings`.
@@ -93,12 +94,13 @@ def predict(
         "simplified": lambda: _simplified(scenario, rows),
         "general": lambda: _enumerated(scenario, rows, how, how.estimator),
         "naive": lambda: _enumerated(scenario, rows, how, "naive"),
+        "optimal": lambda: _optimal(scenario, rows),
         "monte-carlo": lambda: _sampled(scenario, rows, how),
     }
     prediction = Prediction(
         scenario=scenario,
         method=method,
-        quantity=quantity,
+        quantity="optimal" if method == "optimal" else quantity,
         stage="posterior",
         link=rows.means(scenario.network),
         cases=rows.names,
@@ -147,6 +149,42 @@ def _enumerated(scenario: Scenario, rows: LinkRows, how: Settings, estimator: st
             "outcomes": found.structure.outcomes[-1],
             "graphs": found.structure.states,
             "left_out": found.left_out.tolist(),
+        },
+    }
+
+
+def _optimal(scenario: Scenario, rows: LinkRows) -> dict[str, Any]:
+    from stochfuse.engines.contact_chain import expected_optimum, number_of_paths
+
+    network = scenario.network
+    for what, wrong in (
+        ("network.delay", network.delay != (1.0,)),
+        ("unlike agents", len(scenario.sensors) > 1),
+        ("links that differ", not rows.uniform),
+    ):
+        if wrong:
+            raise UsageError(f"method 'optimal' does not take {what} yet; use general or monte-carlo")
+    chain = expected_optimum(
+        scenario.model,
+        scenario.sensors[0],
+        scenario.P0,
+        shared=scenario.correlation == "shared",
+        architecture=network.architecture,
+        agents=network.agents,
+        steps=network.steps,
+        link=rows.at_step,
+    )
+    bound = float(chain.bound.max())
+    notes = [f"the optimum is proved to lie within a relative {bound:.0e} of the value shown"] if bound else []
+    return {
+        "nature": "bound" if bound else "exact",
+        "by_group": chain.P[:, :, None],
+        "group_of": np.zeros(network.agents, dtype=int),
+        "estimator": "optimal",
+        "notes": tuple(notes),
+        "meta": {
+            "paths": number_of_paths(network.architecture, network.agents, network.steps),
+            "relative_bound": chain.bound.tolist(),
         },
     }
 

@@ -533,7 +533,7 @@ def test_reproduce_timing():
         (["predict", "cv-2d", "--method", "general", "--steps", "2", "--statistic", "derivative"], "derivative: expected metric trace or var:STATE, got 'rms:x,y'"),
         (["predict", "--method", "general", "--steps", "9"], "more than --max-graphs 100000"),
         (["predict", "--method", "monte-carlo", "--runs", "1"], "Invalid value for '--runs'"),
-        (["compare", "--methods", "simplified,guess"], "methods: expected one of simplified, general, naive, monte-carlo, got 'guess'"),
+        (["compare", "--methods", "simplified,guess"], "methods: expected one of simplified, general, optimal, naive, monte-carlo, got 'guess'"),
         (["crosscheck", "nowhere.csv"], "nowhere.csv: no such file"),
         (["graph", "nowhere.toml"], "no such file, and no history of that name (known: thesis-example)"),
         (["derive", "general", "--step", "3"], "too many for a closed form"),

@@ -38,7 +38,7 @@ from stochfuse.cli.options import (
 def compare(
     scenario: ScenarioArgument = "thesis-transient",
     methods: Annotated[
-        str, typer.Option(metavar="LIST", help="Methods to compare: simplified, general, naive, monte-carlo.")
+        str, typer.Option(metavar="LIST", help="Methods to compare: simplified, general, optimal, naive, monte-carlo.")
     ] = "general,simplified,naive,monte-carlo",
     reference: Annotated[
         str | None, typer.Option(metavar="METHOD", help="What the others are compared with; default: the most exact.")

@@ -46,6 +46,7 @@ class Method(StrEnum):
 
     simplified = "simplified"
     general = "general"
+    optimal = "optimal"
     naive = "naive"
     monte_carlo = "monte-carlo"
 

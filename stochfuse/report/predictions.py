@@ -19,10 +19,12 @@ METHOD_TITLES = {
     "simplified": "simplified formulation (54)",
     "general": "general formulation (49)",
     "naive": "general formulation (49)",
+    "optimal": "contact chain",
     "monte-carlo": "Monte Carlo",
 }
 ESTIMATOR_TITLES = {
     "broadcast-prior": "",
+    "optimal": ": the best that linear fusion can do with what arrived",
     "local-fusion-graph": " of the Local Fusion Graph",
     "naive": " of naive fusion (42)/(43)",
 }
@@ -138,6 +140,9 @@ class View:
         p = self.prediction
         if p.sampled is not None:
             return f"sampled, {p.sampled.runs:,} runs, seed {p.meta['seed']}; ± one standard error"
+        if p.method == "optimal":
+            paths = f"{p.meta['paths']:,} paths" if p.meta["paths"] < 1e9 else f"{p.meta['paths']:.3g} paths"
+            return f"exact, {paths}" if p.nature == "exact" else f"enclosed in bounds, {paths}"
         if p.outcomes is None:
             return "approximate (mean field)"
         everything = f"{p.meta['outcomes']:,} outcomes"
