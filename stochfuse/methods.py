@@ -60,11 +60,12 @@ def predict(
     scenario : from `load_scenario`.
     link : link probabilities, one row of the result each; an array of shape (rows, agents, agents) gives a matrix µ_ij
         (receiver, sender) per row.  Default: the scenario's cases, else its link, else 0, 0.25, 0.5, 0.75 and 1.
-    method : "simplified": thesis (50)–(54), approximate (mean field); "general": thesis (44)–(49), exact, every
-        outcome with
-        its common information found by the Local Fusion Graph; "naive": the same with naive fusion (42)/(43);
-        "monte-carlo": sampled; "optimal": the best that any linear fusion could do with what arrived, exact, by the contact
-        chain (theory section 6).
+    method : one of
+        "simplified", thesis (50)–(54), approximate (mean field);
+        "general", thesis (44)–(49), exact: every outcome, its common information found by the Local Fusion Graph;
+        "naive", the same with naive fusion (42)/(43);
+        "optimal", the best that any linear fusion could do with what arrived, by the contact chain (theory section 6);
+        "monte-carlo", sampled.
     quantity : "claimed": the covariance that the fusion rule itself reports.
     steady : also solve for the steady state (simplified).
     **settings : see `Settings`.
