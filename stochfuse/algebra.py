@@ -31,6 +31,10 @@ class Algebra(Protocol):
         """A⁻¹ B."""
         ...
 
+    def inverse(self, A: Any) -> Any:
+        """A⁻¹ of a symmetric A."""
+        ...
+
     def symmetric(self, A: Any) -> Any:
         """(A + Aᵀ)/2 where rounding can break the symmetry, A itself where arithmetic is exact."""
         ...
@@ -51,6 +55,14 @@ class _NumPy:
             return np.divide(B, A)
         return np.linalg.solve(A, B)
 
+    def inverse(self, A: Any) -> Any:
+        if np.shape(A)[-1] == 1:
+            return self.solve(A, 1.0)
+        # to unit diagonal first: states in different units, or known to very different precision, then lose nothing
+        diagonal = np.diagonal(A, axis1=-2, axis2=-1)
+        scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+        return np.linalg.inv(A * scale[..., :, None] * scale[..., None, :]) * scale[..., :, None] * scale[..., None, :]
+
     def symmetric(self, A: Any) -> Any:
         return 0.5 * (A + np.swapaxes(A, -1, -2))
 
@@ -64,6 +76,9 @@ class _SymPy:
 
     def solve(self, A: Any, B: Any) -> Any:
         return A.inv() @ B
+
+    def inverse(self, A: Any) -> Any:
+        return A.inv()
 
     def symmetric(self, A: Any) -> Any:
         return A
@@ -88,6 +103,9 @@ class _Field:
         rhs = DomainMatrix([list(row) for row in B], B.shape, domain)
         return np.array(lhs.lu_solve(rhs).to_list(), dtype=object)
 
+    def inverse(self, A: Any) -> Any:
+        return self.solve(A, self.identity_like(A))
+
     def symmetric(self, A: Any) -> Any:
         return A
 
@@ -102,5 +120,5 @@ FIELD: Algebra = _Field()
 
 
 def inverse(A: Any, algebra: Algebra = NUMPY) -> Any:
-    """Return A⁻¹, symmetric if A is a symmetric floating-point matrix only up to rounding."""
-    return algebra.solve(A, algebra.identity_like(A))
+    """Return A⁻¹ of a symmetric A; of a floating-point matrix it is symmetric only up to rounding."""
+    return algebra.inverse(A)

@@ -86,4 +86,11 @@ def compare(
     elif reference not in methods:
         raise UsageError(f"reference: expected one of the methods compared ({', '.join(methods)}), got '{reference}'")
     ordered = [reference, *(m for m in methods if m != reference)]
-    return Comparison(tuple(predict(scenario, link, method, **settings) for method in ordered))
+    return Comparison(tuple(_predict(scenario, link, method, settings) for method in ordered))
+
+
+def _predict(scenario: Scenario, link: Any, method: str, settings: dict[str, Any]) -> Prediction:
+    try:
+        return predict(scenario, link, method, **settings)
+    except UsageError as error:
+        raise UsageError(f"{method} cannot be compared here, leave it out of the methods: {error}") from None

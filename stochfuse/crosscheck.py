@@ -5,16 +5,22 @@ first, so that the runs of a cell are independent, and
 
     z = (mean − expected) / standard error
 
-is standard normal if the simulator is right.  The standard error is the sample's; where the prediction knows the
-exact variance over the
-outcomes, that variance takes the place of a single agent's sample variance, so that outcomes too rare to have been
-seen are reckoned with.  Two tests share the level α, Bonferroni's way:
+is nearly standard normal if the simulator is right.  Expected is the mean of the metric over the outcomes, where the
+prediction knows them, else the metric of the expected covariance.  The standard error is the sample's; where the
+outcomes are known, their variance takes the place of a single agent's sample variance, so that outcomes too rare to
+have been seen are reckoned with.
 
-    the largest |z|, corrected for the number of cells (finds an error anywhere)
-    the sum of z² over cells and steps, decorrelated within the runs of a link (Hotelling's T²; finds a small error
-    everywhere)
+Where runs are few or outcomes are rare the tails are far from normal.  There Chernoff's bound takes the place of
+the normal tail, p ≤ 2 exp(−runs · sup_θ [θ·mean − log E exp(θ·covariance of one agent)]), which holds for any number of
+runs and any dependence between the agents.  (Without known outcomes: Student's t.)
 
-The simulator disagrees if either does.
+Two tests share the level α, Bonferroni's way:
+
+    the smallest p, corrected for the number of cells (finds an error anywhere)
+    all cells together: Hotelling's T² over the steps of a link, over links by Fisher's method (finds a small error
+    everywhere); only of cells with enough runs for it, and not where only means are given
+
+The simulator disagrees if either does.  Digits that the file does not give are never held against it.
 """
 
 from __future__ import annotations
@@ -25,18 +31,24 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import erfc, sqrt
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from stochfuse.errors import UsageError
+from stochfuse.general import Distribution
 from stochfuse.metrics import Metric
 from stochfuse.prediction import Prediction
 from stochfuse.scenario import read_file
 
+if TYPE_CHECKING:
+    from stochfuse.general import Outcomes
+
 ALPHA = 0.001
 RUN_COLUMNS = ("run", "agent", "step", "link", "covariance", "error")
 MEAN_COLUMNS = ("agent", "step", "link", "covariance", "count", "std")
+NORMAL, ENOUGH_RUNS, SKEWED = 0.3, 200, 0.1
+"""Largest correction of the normal tail for skewness with which it is used; least runs, largest skewness for T²."""
 ROUNDING = 1e-9
 """Relative difference that is rounding, besides that of the digits in the file."""
 
@@ -57,7 +69,7 @@ class Results:
     covariance : (rows,) claimed covariance: of a run, or the mean over `count` runs.
     run : (rows,) number of the run, or None if the rows are means.
     error : (rows,) error of the estimate, not-a-number where not given; or None.
-    count, std : (rows,) number of runs and their standard deviation (NaN: not given) of means, or None.
+    count, std : (rows,) number of independent runs and one run's standard deviation (NaN: not given) of means, or None.
     line, what : (rows,) number of the line or record of each row, and which of the two it is.
     resolution : half a unit in the last decimal place that the covariances are given with.
     """
@@ -123,7 +135,7 @@ class Verdict(NamedTuple):
     alpha : probability that a right simulator is called wrong.
     cells : one per link probability, step and group.
     p_largest : p-value of the largest |z|, corrected for the number of cells.
-    p_together : p-value of all cells together, or None where only means are given.
+    p_together : p-value of all cells together, or None where there are too few runs for it, or only means.
     consistency : per link text, mean squared error over mean claimed covariance, where errors are given.
     """
 
@@ -155,7 +167,8 @@ def read_results(source: str | Path) -> Results:
     else:
         header, rows, what = _from_csv(name, text.lstrip("\ufeff"))
     if not rows:
-        raise ResultsError(f"{name}: no rows under the headings {', '.join(header)}")
+        under = f" under the headings {', '.join(header)}" if header else ""
+        raise ResultsError(f"{name}: no rows{under}; expected columns {', '.join(RUN_COLUMNS)}")
     return _checked(name, header, rows, what)
 
 
@@ -338,9 +351,10 @@ def check_results(results: Results, prediction: Prediction, metric: Metric, alph
     ]
     if results.agent.max() == 0 and len(groups) > 1:
         raise ResultsError(f"{results.source}: the agents differ: expected a column 'agent', got none")
-    raw, together = _cells_of_means(results, prediction, metric, groups), None
+    known = _known(prediction, metric)
+    raw, together = _cells_of_means(results, prediction, known, metric, groups), None
     if results.run is not None:
-        raw, together = _cells_of_runs(results, prediction, metric, groups)
+        raw, together = _cells_of_runs(results, prediction, known, metric, groups)
     level = alpha / 2 if together is not None else alpha
     cells = [cell._replace(p=min(1.0, cell.p * len(raw)), agrees=cell.p * len(raw) > level) for cell in raw]
     largest = min(cell.p for cell in cells)
@@ -348,125 +362,198 @@ def check_results(results: Results, prediction: Prediction, metric: Metric, alph
     return Verdict(agrees, alpha, cells, largest, together, _consistency(results))
 
 
+class _Known(NamedTuple):
+    """Mean, standard deviation and skewness of an agent's metric over the outcomes, (rows, steps), and the outcomes."""
+
+    mean: np.ndarray
+    deviation: np.ndarray
+    skewness: np.ndarray
+    outcomes: Outcomes
+    group: int
+
+
+def _known(prediction: Prediction, metric: Metric) -> list[_Known | None]:
+    """What is known of every group of agents."""
+    groups = range(prediction.by_group.shape[2])
+    outcomes = prediction.outcomes
+    if outcomes is None:
+        return [None for _ in groups]
+    return [
+        _Known(
+            outcomes.over_outcomes(metric, [g], Distribution.mean),
+            np.sqrt(outcomes.over_outcomes(metric, [g], Distribution.variance)),
+            outcomes.over_outcomes(metric, [g], Distribution.skewness),
+            outcomes,
+            g,
+        )
+        for g in groups
+    ]
+
+
 def _cells_of_runs(
-    results: Results, prediction: Prediction, metric: Metric, groups: Sequence[tuple[int, ...]]
-) -> tuple[list[Cell], float]:
-    cells, statistic, freedom = [], 0.0, 0
-    known = _exact_deviations(prediction, metric)
+    results: Results,
+    prediction: Prediction,
+    known: Sequence[_Known | None],
+    metric: Metric,
+    groups: Sequence[tuple[int, ...]],
+) -> tuple[list[Cell], float | None]:
+    cells, by_link = [], []
     run = results.run if results.run is not None else np.zeros(0, dtype=np.int64)
     for row, link in enumerate(results.links):
         here = results.link == link
-        of_link, deviations = [], []
+        of_link, samples, skewed = [], [], []
         for g, agents in enumerate(groups):
             mine = here & (np.isin(results.agent, agents) | (results.agent == 0))
-            expected = prediction.of_agent(int(agents[0]))[row]
-            for step in np.unique(results.step[mine]):
+            for step in np.unique(results.step[mine]).tolist():
                 chosen = mine & (results.step == step)
                 runs, of_run = np.unique(run[chosen], return_inverse=True)
                 values = np.bincount(of_run, results.covariance[chosen]) / np.bincount(of_run)
                 if len(runs) < 2:
                     raise ResultsError(f"{results.source}: link {link}, step {step}: expected at least 2 runs, got 1")
-                single = float(results.covariance[chosen].std(ddof=1))
-                error = _standard_error(values, single, None if known is None else known[g][row, step - 1])
-                target = float(metric.of(expected[step - 1]))
-                mean, exact = float(values.mean()), results.resolution
-                of_link.append(_cell(link, row, int(step), agents, len(runs), mean, error, target, exact))
-                deviations.append((runs, values))
+                deviation, exact = float(values.std(ddof=1)), known[g]
+                if exact is not None:
+                    share = _share(deviation, results.covariance[chosen], len(runs))
+                    deviation = _deviation(exact, row, step) * share
+                found = np.unique(results.agent[chosen]).tolist()
+                whose = tuple(found) if found != [0] else agents
+                expected = float(metric.of(prediction.by_group[row, step - 1, g]))
+                cell = Cell(link, row, step, whose, len(runs), float(values.mean()), deviation, expected, 0, 0, True)
+                of_link.append(_judged(cell, known[g], metric, results.resolution))
+                samples.append((runs, values))
+                skewed.append(_skewness(values, known[g], row, step) / sqrt(len(runs)))
         cells += of_link
-        t, f = _together(of_link, deviations)
-        statistic, freedom = statistic + t, freedom + f
-    return cells, _chi_squared_tail(statistic, freedom)
+        p = _together(of_link, samples, skewed)
+        by_link += [] if p is None else [p]
+    if not by_link:
+        return cells, None
+    return cells, _chi_squared_tail(-2.0 * float(np.log(np.maximum(by_link, 1e-300)).sum()), 2 * len(by_link))
 
 
 def _cells_of_means(
-    results: Results, prediction: Prediction, metric: Metric, groups: Sequence[tuple[int, ...]]
+    results: Results,
+    prediction: Prediction,
+    known: Sequence[_Known | None],
+    metric: Metric,
+    groups: Sequence[tuple[int, ...]],
 ) -> list[Cell]:
     cells = []
     if results.count is None:
         return cells
-    known = _exact_deviations(prediction, metric)
     for place in range(len(results.step)):
         agent, step, row = int(results.agent[place]), int(results.step[place]), results.links.index(results.link[place])
         group = int(prediction.group_of[max(0, agent - 1)])
+        of_group = known[group]
         std = np.nan if results.std is None else float(results.std[place])
-        exact = None if known is None else float(known[group][row, step - 1])
-        if np.isnan(std) and exact is None:
+        if np.isnan(std) and of_group is None:
             raise ResultsError(
                 f"{results.at(place)}, column 'std': expected a number, since method {prediction.method} does not "
                 f"know the "
                 "spread over the outcomes"
             )
-        deviation = std if exact is None else exact
-        count = int(results.count[place])
+        deviation = std if of_group is None else _deviation(of_group, row, step)
         expected = float(metric.of(prediction.by_group[row, step - 1, group]))
-        agents = (agent,) if agent else groups[group]
-        error = deviation / sqrt(count)
-        mean = float(results.covariance[place])
-        text = str(results.link[place])
-        cells.append(_cell(text, row, step, agents, count, mean, error, expected, results.resolution))
+        whose = (agent,) if agent else groups[group]
+        runs, mean, text = int(results.count[place]), float(results.covariance[place]), str(results.link[place])
+        cell = Cell(text, row, step, whose, runs, mean, deviation, expected, 0, 0, True)
+        cells.append(_judged(cell, of_group, metric, results.resolution))
     return cells
 
 
-def _cell(
-    link: str,
-    row: int,
-    step: int,
-    agents: Sequence[int],
-    runs: int,
-    mean: float,
-    error: float,
-    expected: float,
-    resolution: float,
-) -> Cell:
-    difference = mean - expected
-    if abs(difference) <= ROUNDING * abs(expected) + (resolution if error == 0 else 0.0):
-        z = 0.0
+def _share(averaged: float, each: np.ndarray, runs: int) -> float:
+    """By how much the average over a run's like agents varies less than one agent: only a large sample says."""
+    single = float(each.std(ddof=1))
+    if runs < ENOUGH_RUNS or single == 0:
+        return 1.0
+    return float(np.clip(averaged / single, sqrt(runs / len(each)), 1.0))
+
+
+def _deviation(known: _Known, row: int, step: int) -> float:
+    return float(known.deviation[row, step - 1])
+
+
+def _skewness(values: np.ndarray, known: _Known | None, row: int, step: int) -> float:
+    if known is not None:
+        return float(known.skewness[row, step - 1])
+    deviation = values - values.mean()
+    variance = float((deviation**2).mean())
+    return float((deviation**3).mean()) / variance**1.5 if variance > 0 else 0.0
+
+
+def _judged(cell: Cell, known: _Known | None, metric: Metric, resolution: float) -> Cell:
+    """Complete a cell that comes with the standard deviation of a run in the place of the standard error."""
+    expected = cell.expected if known is None else float(known.mean[cell.row, cell.step - 1])
+    error = cell.error / sqrt(cell.runs)
+    difference = cell.mean - expected
+    given = resolution + ROUNDING * abs(expected)
+    beyond = float(np.copysign(max(0.0, abs(difference) - given), difference))
+    z = beyond / error if error > 0 else 0.0 if beyond == 0 else float(np.copysign(np.inf, beyond))
+    if known is None:
+        from scipy.special import stdtr
+
+        p = 2.0 * float(stdtr(cell.runs - 1, -abs(z)))
     else:
-        z = difference / error if error > 0 else float(np.copysign(np.inf, difference))
-    return Cell(link, row, step, tuple(map(int, agents)), runs, mean, error, expected, z, erfc(abs(z) / sqrt(2)), True)
+        skewness = abs(float(known.skewness[cell.row, cell.step - 1]))
+        p = erfc(abs(z) / sqrt(2))
+        if 0 < abs(z) < np.inf and skewness * abs(z) ** 3 / (6 * sqrt(cell.runs)) > NORMAL:
+            p = max(p, _chernoff(known, metric, cell, expected + beyond))
+    return cell._replace(expected=expected, error=error, z=z, p=p)
 
 
-def _exact_deviations(prediction: Prediction, metric: Metric) -> list[np.ndarray] | None:
-    """Standard deviation of one agent's covariance over the outcomes, (rows, steps) per group, where it is known."""
-    if prediction.outcomes is None:
+def _chernoff(known: _Known, metric: Metric, cell: Cell, mean: float) -> float:
+    """Chernoff's bound on the probability that the mean of independent runs is as far off on either side."""
+    from scipy.optimize import minimize_scalar
+
+    rows = slice(cell.row, cell.row + 1)
+    spread = known.outcomes.distribution(metric, cell.step, [known.group], rows)
+    probability = spread.probability[0]
+    possible = probability > 0
+    log_p, v = np.log(probability[possible]), spread.values[possible] - mean
+    scale = np.abs(v).max()
+    if v.max() < -1e-9 * scale or v.min() > 1e-9 * scale:
+        return 0.0
+
+    def cumulant(t: float) -> float:
+        terms = log_p + t * v / scale
+        largest = terms.max()
+        return float(largest + np.log(np.exp(terms - largest).sum()))
+
+    least = minimize_scalar(cumulant, bounds=(-1e4, 1e4), method="bounded", options={"xatol": 1e-6})
+    return min(1.0, 2.0 * float(np.exp(min(0.0, cell.runs * least.fun))))
+
+
+def _together(
+    cells: Sequence[Cell], samples: Sequence[tuple[np.ndarray, np.ndarray]], skewed: Sequence[float]
+) -> float | None:
+    """Hotelling's T² of a link's cells over the runs that they share: its p-value, None if there are too few runs."""
+    from scipy.special import fdtrc
+
+    fit = [
+        i
+        for i, cell in enumerate(cells)
+        if cell.runs >= ENOUGH_RUNS and abs(skewed[i]) < SKEWED and np.isfinite(cell.z)
+    ]
+    fit = [i for i in fit if samples[i][1].std() > ROUNDING * abs(samples[i][1].mean())]
+    if not fit:
         return None
-    return [prediction.outcomes.statistic("std", metric, [g]) for g in range(prediction.by_group.shape[2])]
-
-
-def _standard_error(values: np.ndarray, single: float, exact: float | None) -> float:
-    sampled = float(values.std(ddof=1))
-    if exact is None:
-        return sampled / sqrt(len(values))
-    # the average over like agents varies less than one agent: how much less, only the sample says
-    return exact * (sampled / single if single > 0 else 1.0) / sqrt(len(values))
-
-
-def _together(cells: Sequence[Cell], samples: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[float, int]:
-    """Hotelling's T² of a link's cells over the runs that all of them have, a χ² value, and its degrees of freedom."""
-    varying = [i for i, cell in enumerate(cells) if cell.error > 0 and np.isfinite(cell.z)]
-    if not varying:
-        return 0.0, 0
-    runs = samples[varying[0]][0]
-    for i in varying[1:]:
+    runs = samples[fit[0]][0]
+    for i in fit[1:]:
         runs = np.intersect1d(runs, samples[i][0])
-    if len(runs) <= 4 * len(varying):
-        return 0.0, 0
-    X = np.stack([samples[i][1][np.searchsorted(samples[i][0], runs)] for i in varying], axis=1)
-    seen = X.std(axis=0) > ROUNDING * np.abs(X.mean(axis=0))  # what did not vary says nothing about correlation
-    if not seen.any():
-        return 0.0, 0
-    z = np.array([cells[i].z for i in varying])[seen]
-    values, vectors = np.linalg.eigh(np.corrcoef(X[:, seen], rowvar=False).reshape(len(z), len(z)))
+    if len(runs) < ENOUGH_RUNS:
+        return None
+    X = np.stack([samples[i][1][np.searchsorted(samples[i][0], runs)] for i in fit], axis=1)
+    z = np.array([cells[i].z for i in fit])
+    values, vectors = np.linalg.eigh(np.corrcoef(X, rowvar=False).reshape(len(z), len(z)))
     # directions that hardly vary are rounding
     firm = values > 1e-6
     components = (vectors.T @ z)[firm] / np.sqrt(values[firm])
-    return float((components**2).sum()), int(firm.sum())
+    n, d = len(runs), int(firm.sum())
+    return float(fdtrc(d, n - d, float((components**2).sum()) * (n - d) / (d * (n - 1))))
 
 
 def _chi_squared_tail(statistic: float, freedom: int) -> float:
     from scipy.special import chdtrc
 
-    return float(chdtrc(freedom, statistic)) if freedom else 1.0
+    return float(chdtrc(freedom, statistic))
 
 
 def _consistency(results: Results) -> dict[str, float]:

@@ -12,7 +12,7 @@ is a polynomial whose coefficients are found once; with unequal µ_ij(k) every r
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -27,18 +27,29 @@ from stochfuse.engines.enumeration import (
     enumerate_outcomes,
     expectation,
 )
-from stochfuse.errors import UsageError
+from stochfuse.errors import StochfuseError, UsageError
 from stochfuse.estimators.local_fusion_graph import LocalFusionGraph
 from stochfuse.estimators.naive import NaiveFusion
-from stochfuse.events import Rows, bernstein, events, monomials, orbits, relabellings, weights_for
+from stochfuse.events import (
+    MOST_AGENTS_RELABELLED,
+    Rows,
+    bernstein,
+    events,
+    monomials,
+    orbits,
+    relabellings,
+    weights_for,
+)
 from stochfuse.information import Information, Ledger, Sources, evaluate
 from stochfuse.kalman import Estimate, to_information
 from stochfuse.metrics import Metric
-from stochfuse.network import LinkRows
+from stochfuse.network import LinkRows, Network, number_of_senders
 from stochfuse.scenario import Scenario
 
 MOST_PROBABILITIES = 20_000_000
 """Probabilities that a distribution may hold at a time."""
+MOST_AGENTS, MOST_SENDERS = 40, 12
+"""Agents, and agents that one of them may hear, up to which outcomes are listed."""
 ESTIMATORS = {"local-fusion-graph": LocalFusionGraph, "naive": NaiveFusion}
 
 
@@ -73,7 +84,16 @@ class Outcomes:
 
         Where outcomes were left out: given that the outcome is one of those that were not.
         """
+        return [found for found, _ in self._expected]
+
+    @cached_property
+    def _expected(self) -> list[tuple[list[Estimate], float]]:
         return [expectation(ending, self.values, self.weights, len(self.groups)) for ending in self.structure.endings]
+
+    @property
+    def rounding(self) -> float:
+        """Estimate of the largest relative rounding error of an outcome's covariance."""
+        return 2e-16 * max(magnified for _, magnified in self._expected)
 
     def coefficients(self, step: int, group: int = 0) -> np.ndarray:
         """A_0 … A_L of E[P(step)](µ) = Σ A_c µ^c (1−µ)^(L−c), shape (L + 1, d, d).
@@ -92,7 +112,16 @@ class Outcomes:
         return self.expectations[step - 1][group].P
 
     def covariance(self, link: np.ndarray | None = None) -> np.ndarray:
-        """Expected covariance, (rows, steps, groups, d, d), at the scenario's rows or at some link probabilities."""
+        """Expected covariance, (rows, steps, groups, d, d), at the rows or, of a polynomial, at some link
+        probabilities.
+
+        Raises
+        ------
+        UsageError
+            If link probabilities are given and there is no polynomial.
+        """
+        if link is not None:
+            self.coefficients(1)
         return self._stacked([[self._at(e.P, link) for e in step] for step in self.expectations])
 
     def states(self) -> np.ndarray:
@@ -148,19 +177,22 @@ class Outcomes:
             if not metric.linear:
                 raise UsageError(f"derivative: expected metric trace or var:STATE, got '{metric.name}'")
             return metric.of(np.average(self.derivative()[:, :, groups], axis=2, weights=share))
-        columns = []
-        for step in range(1, len(self.structure.endings) + 1):
-            parts = []
-            for rows in self._blocks_of_rows(step):
-                spread = self.distribution(metric, step, groups, rows)
-                of = {
-                    "variance": spread.variance,
-                    "std": lambda spread=spread: np.sqrt(spread.variance()),
-                    "quantile": lambda spread=spread: spread.quantile(number),
-                    "at-most": lambda spread=spread: spread.at_most(number),
-                }
-                parts.append(of[kind]())
-            columns.append(np.concatenate(parts))
+        of: dict[str, Callable[[Distribution], np.ndarray]] = {
+            "variance": Distribution.variance,
+            "std": lambda spread: np.sqrt(spread.variance()),
+            "quantile": lambda spread: spread.quantile(number),
+            "at-most": lambda spread: spread.at_most(number),
+        }
+        return self.over_outcomes(metric, groups, of[kind])
+
+    def over_outcomes(
+        self, metric: Metric, groups: Sequence[int], of: Callable[[Distribution], np.ndarray]
+    ) -> np.ndarray:
+        """Return what a function (rows of it) makes of the distribution at every step, (rows, steps)."""
+        columns = [
+            np.concatenate([of(self.distribution(metric, step, groups, rows)) for rows in self._blocks_of_rows(step)])
+            for step in range(1, len(self.structure.endings) + 1)
+        ]
         return np.stack(columns, axis=1)
 
     def _blocks_of_rows(self, step: int) -> list[slice]:
@@ -180,11 +212,14 @@ class Outcomes:
         ending = self.structure.endings[step - 1]
         agents = sum(len(self.groups[g]) for g in groups)
         values, weights = [], []
-        for view, states, estimate in claimed(ending, self.values):
+        for view, states, estimate, _ in claimed(ending, self.values):
             shares = [(view.shares[g], len(self.groups[g]) / agents) for g in groups if view.shares[g] is not None]
             if not shares:
                 continue
-            value = metric.of(estimate.P)
+            with np.errstate(over="ignore", invalid="ignore", under="ignore"):
+                value = metric.of(estimate.P)
+            if not np.isfinite(value).all():
+                raise StochfuseError(f"{metric.label} is not finite in some outcome: it grows beyond floating point")
             before = self._probability(ending.weights[states], rows)
             cells = np.repeat(self._probability(view.factors, rows), np.diff([*view.starts, value.shape[1]]), axis=1)
             last = sum(part * self._probability(share[None], rows) for share, part in shares)
@@ -235,11 +270,22 @@ class Distribution:
         """Variance of the metric over the outcomes, (rows,)."""
         return (self.probability * (self.values - self.mean()[:, None]) ** 2).sum(axis=1)
 
+    def skewness(self) -> np.ndarray:
+        """Third central moment over the standard deviation cubed, (rows,); 0 where nothing varies."""
+        variance = self.variance()
+        third = (self.probability * (self.values - self.mean()[:, None]) ** 3).sum(axis=1)
+        return np.divide(third, variance**1.5, out=np.zeros_like(third), where=variance > 0)
+
     def quantile(self, level: float) -> np.ndarray:
         """Least value that is not exceeded with at least that probability, (rows,)."""
-        below = np.cumsum(self.probability, axis=1)
-        # a level that the sum reaches but for rounding counts as reached
-        return self.values[np.minimum((below < level - 1e-12).sum(axis=1), len(self.values) - 1)]
+        from_below, from_above = (
+            np.cumsum(self.probability, axis=1),
+            np.cumsum(self.probability[:, ::-1], axis=1)[:, ::-1],
+        )
+        # of both tails the nearer one counts, so that rounding of the sum does not hide rare values; values without any
+        # probability are none
+        reached = np.where(level > 0.5, from_above - self.probability <= 1.0 - level, from_below >= level)
+        return self.values[(reached & (self.probability > 0)).argmax(axis=1)]
 
     def at_most(self, limit: float) -> np.ndarray:
         """P(metric ≤ limit), (rows,)."""
@@ -278,13 +324,14 @@ def outcomes(
     alike = records is None
     labels = scenario.sensor_of if alike else tuple(range(network.agents))
     ledger = Ledger()
+    check_size(network)
     permutations = relabellings(network, rows, labels)
     made = ESTIMATORS[estimator](
         ledger, labels, shared=scenario.correlation == "shared", relabellings=None if plain else permutations
     )
     per_step = [events(network, rows, step) for step in range(1, network.steps + 1)]
     weights = Rows(len(rows.link)) if prune else weights_for(network, rows, sum(map(len, per_step)))
-    groups = tuple(orbits(network.agents, permutations))
+    groups = groups_alike(network, rows, labels, permutations)
     request = Request(
         agents=network.agents,
         steps=network.steps,
@@ -299,6 +346,25 @@ def outcomes(
     sources = sources_of(scenario, records)
     structure = enumerate_outcomes(made, request, progress)
     return Outcomes(scenario, rows, groups, structure, evaluate(ledger, sources), weights)
+
+
+def groups_alike(
+    network: Network, rows: LinkRows, labels: Sequence[int], permutations: Sequence[tuple[int, ...]]
+) -> tuple[tuple[int, ...], ...]:
+    """Groups of agents that some relabelling takes into one another; of too many to look, all or none."""
+    if network.agents > MOST_AGENTS_RELABELLED and rows.uniform and len(set(labels)) == 1:
+        return (tuple(range(network.agents)),)
+    return tuple(orbits(network.agents, permutations))
+
+
+def check_size(network: Network) -> None:
+    """Raise UsageError if there are too many agents to list what one of them may hear."""
+    if number_of_senders(network.architecture, network.agents) > MOST_SENDERS or network.agents > MOST_AGENTS:
+        raise UsageError(
+            f"every outcome is gone through for at most {MOST_AGENTS} agents that hear at most {MOST_SENDERS} "
+            f"others each, "
+            f"got {network.agents} agents, {network.architecture}: use --method optimal or --method monte-carlo"
+        )
 
 
 def sources_of(scenario: Scenario, records: np.ndarray | None = None, *, by_agent: bool = False) -> Sources:

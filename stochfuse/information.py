@@ -22,7 +22,14 @@ import numpy as np
 
 from stochfuse.algebra import NUMPY, Algebra
 from stochfuse.errors import NoAnswerError, UsageError
-from stochfuse.kalman import Information, from_information, predict, to_information, update_information
+from stochfuse.kalman import (
+    Information,
+    from_information,
+    predict,
+    predict_information,
+    to_information,
+    update_information,
+)
 from stochfuse.model import Model, Sensor, at_step
 
 START, MEASURED, PRIOR = "start", "measured", "prior"
@@ -123,10 +130,19 @@ class Sources:
         return update_information(nothing, at_step(sensor.H, step), at_step(sensor.R, step), z, algebra=self.algebra)
 
     def forward(self, information: Information, step: int) -> Information:
-        """Time update of an information pair (or a stack) from step − 1 to the step."""
+        """Time update of an information pair (or a stack) from step − 1 to the step.
+
+        In information form, which inverts no covariance, wherever F has an inverse.
+        """
         F, Q, Bu = (at_step(M, step) for M in (self.model.F, self.model.Q, self.model.Bu))
+        if self._invertible(step):
+            return predict_information(information, F, Q, Bu, algebra=self.algebra)
         estimate = from_information(information, algebra=self.algebra)
         return to_information(predict(estimate, F, Q, Bu, algebra=self.algebra), algebra=self.algebra)
+
+    def _invertible(self, step: int) -> bool:
+        F = at_step(self.model.F, step)
+        return F.dtype != object and np.linalg.cond(F) < 1e8
 
 
 def evaluate(ledger: Ledger, sources: Sources) -> Information:
@@ -156,7 +172,7 @@ def evaluate(ledger: Ledger, sources: Sources) -> Information:
         brought = np.flatnonzero(prior & (atom_step == step))
         if len(brought):
             before = _pair(values[of[brought]], d, states)
-            check_definite(before.Y, step - 1)
+            check_definite(before.Y, step - 1, rounding=1e-9)
             try:
                 atoms[brought] = _packed(sources.forward(before, step))
             except np.linalg.LinAlgError:
@@ -205,15 +221,28 @@ def _pair(packed: np.ndarray, d: int, states: bool) -> Information:
     return Information(packed[..., d:] if states else None, packed[..., :d])
 
 
-def check_definite(Y: np.ndarray, step: int) -> None:
-    """Raise NoAnswerError if an information matrix of a step's stack is not positive definite."""
+def check_definite(Y: np.ndarray, step: int, *, rounding: float = 0.0) -> None:
+    """Raise NoAnswerError if an information matrix of a step's stack is not positive definite.
+
+    Parameters
+    ----------
+    rounding : how negative the smallest eigenvalue, scaled to unit diagonal, may be.
+    """
     try:
         fine = bool((Y > 0).all()) if Y.shape[-1] == 1 else np.isfinite(np.linalg.cholesky(Y)).all()
     except np.linalg.LinAlgError:
-        fine = False
+        fine = rounding > 0 and _almost_definite(Y, rounding)
     if not fine:
         raise NoAnswerError(
             f"at step {step} the information claimed in some outcome is not positive definite: what is taken for "
             f"common "
             "exceeds what is known, and no covariance follows"
         )
+
+
+def _almost_definite(Y: np.ndarray, rounding: float) -> bool:
+    diagonal = np.diagonal(Y, axis1=-2, axis2=-1)
+    if not (diagonal > 0).all():
+        return False
+    scale = 1.0 / np.sqrt(diagonal)
+    return bool((np.linalg.eigvalsh(Y * scale[..., :, None] * scale[..., None, :]) > -rounding).all())

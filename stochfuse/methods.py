@@ -136,12 +136,20 @@ def _enumerated(scenario: Scenario, rows: LinkRows, how: Settings, estimator: st
     left_out = float(found.left_out.max())
     notes = []
     if left_out > 1e-12:
+        row, step = np.unravel_index(found.left_out.argmax(), found.left_out.shape)
         notes.append(
-            f"outcomes of probability up to {left_out:.2g} are left out; what is shown holds given one of the others"
+            f"outcomes of probability up to {left_out:.2g} (at µ = {rows.means(scenario.network)[row]:g}, step "
+            f"{step + 1}) are "
+            "left out; what is shown holds given one of the others"
+        )
+    by_group = found.covariance()
+    if found.rounding > 1e-9:
+        notes.append(
+            f"ill-conditioned: rounding may reach a relative {found.rounding:.0e} in the covariance of some outcome"
         )
     return {
         "nature": "exact" if left_out <= 1e-12 else "approximate",
-        "by_group": found.covariance(),
+        "by_group": by_group,
         "group_of": _group_of(found.groups),
         "estimator": estimator,
         "notes": tuple(notes),

@@ -17,12 +17,14 @@ import numpy as np
 from stochfuse.engines import Progress
 from stochfuse.engines.monte_carlo import Experiment, Sample, sample
 from stochfuse.errors import UsageError
-from stochfuse.events import events, orbits, relabellings
-from stochfuse.general import ESTIMATORS, sources_of
+from stochfuse.events import events, relabellings
+from stochfuse.general import ESTIMATORS, groups_alike, sources_of
 from stochfuse.metrics import Metric
 from stochfuse.network import LinkRows
 from stochfuse.scenario import Scenario
 
+MOST_AGENTS, MOST_NUMBERS = 60, 500_000_000
+"""Agents whose sets fit a machine word, and claimed values that a sample may hold."""
 MANY = 10_000
 """Runs, over all rows, from which on another process pays for its start."""
 STEP = 1e-4
@@ -101,6 +103,15 @@ def sampled(
         if value < least:
             raise UsageError(f"{name}: expected a whole number of at least {least}, got {value}")
     network, labels = scenario.network, scenario.sensor_of
+    if network.agents > MOST_AGENTS:
+        raise UsageError(f"method 'monte-carlo' takes at most {MOST_AGENTS} agents, got {network.agents}")
+    numbers = runs * len(rows.link) * network.steps * network.agents
+    if numbers > MOST_NUMBERS:
+        raise UsageError(
+            f"runs: {runs} runs for {len(rows.link)} link probabilities, {network.steps} steps and "
+            f"{network.agents} agents are "
+            f"{numbers:.3g} values; expected at most {MOST_NUMBERS:.3g}"
+        )
     permutations = relabellings(network, rows, labels)
     shared = scenario.correlation == "shared"
     experiment = Experiment(
@@ -116,4 +127,4 @@ def sampled(
         workers = len(os.sched_getaffinity(0)) if runs * len(rows.link) >= MANY else 1
     told = None if progress is None else lambda done, total: progress.advance(0, done, total)
     drawn = sample(experiment, len(rows.link), workers=workers, progress=told)
-    return Sampled(drawn, tuple(orbits(network.agents, permutations)))
+    return Sampled(drawn, groups_alike(network, rows, labels, permutations))

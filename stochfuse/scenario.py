@@ -153,7 +153,9 @@ def link_rows(scenario: Scenario, link: Any = None) -> LinkRows:
             return uniform_rows(np.atleast_1d(array))
         check.note("link", "probabilities between 0 and 1", f"{array.min() if array.min() < 0 else array.max():g}")
     elif array is not None and array.ndim == 3 and array.size:
-        matrices = [check.link("link", matrix, network.agents, network.steps) for matrix in array]
+        matrices = [
+            _link(check, "link", matrix, network.agents, network.steps, network.architecture) for matrix in array
+        ]
         if not check.problems:
             return stacked_rows(None, [m for m in matrices if m is not None], network)
     elif array is not None:
@@ -318,6 +320,11 @@ def _network(check: Checker, table: Mapping[str, Any]) -> Network | None:
 
 def _link(check: Checker, path: str, value: Any, agents: int, steps: int, architecture: str) -> np.ndarray | None:
     link = check.link(path, value, agents, steps)
+    _check_broadcast(check, path, link, agents, architecture)
+    return link
+
+
+def _check_broadcast(check: Checker, path: str, link: np.ndarray | None, agents: int, architecture: str) -> None:
     if link is not None and link.ndim >= 2 and architecture == "broadcast":
         others = np.where(np.eye(agents, dtype=bool), np.nan, link)
         with np.errstate(invalid="ignore"):
@@ -326,7 +333,6 @@ def _link(check: Checker, path: str, value: Any, agents: int, steps: int, archit
             check.note(
                 path, "equal probabilities in each column (a broadcast is heard by all or by none)", "unequal ones"
             )
-    return link
 
 
 def _delay(check: Checker, value: Any) -> tuple[float, ...]:

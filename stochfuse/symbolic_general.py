@@ -21,10 +21,10 @@ import sympy
 from sympy.polys.fields import field
 
 from stochfuse.algebra import FIELD
-from stochfuse.engines.enumeration import Request, enumerate_outcomes
+from stochfuse.engines.enumeration import Request, TooManyError, enumerate_outcomes
 from stochfuse.errors import UsageError
 from stochfuse.events import Counts, events, orbits, relabellings
-from stochfuse.general import ESTIMATORS
+from stochfuse.general import ESTIMATORS, check_size
 from stochfuse.information import Information, Ledger, Sources, evaluate_exactly
 from stochfuse.model import Model, Sensor
 from stochfuse.network import Network, uniform_rows
@@ -125,6 +125,7 @@ class GeneralForm:
     def _enumerated(self) -> tuple[Ledger, dict[int, list[Any]], int]:
         """Ledger, weight by number of arrivals of every value claimed at the step, and number of links L."""
         network = Network(self.agents, self.step, self.architecture, None)
+        check_size(network)
         rows, labels = uniform_rows([0.5]), (0,) * self.agents
         permutations = relabellings(network, rows, labels)
         drawn = events(network, rows, 1)
@@ -133,7 +134,13 @@ class GeneralForm:
         estimator = ESTIMATORS[self.estimator](ledger, labels, shared=self.shared, relabellings=permutations)
         groups = tuple(orbits(self.agents, permutations))
         request = Request(self.agents, self.step, (1.0,), lambda _: drawn, weights, groups, most=20_000)
-        ending = enumerate_outcomes(estimator, request).endings[-1]
+        try:
+            ending = enumerate_outcomes(estimator, request).endings[-1]
+        except TooManyError:
+            raise UsageError(
+                f"step {self.step} of {self.agents} agents has too many outcomes for an exact form: give fewer agents "
+                f"or steps"
+            ) from None
         if sum(view.ids.shape[0] * len(view.terms[0][1]) for view in ending.views) > MOST_OUTCOMES:
             raise UsageError(f"step {self.step} of {self.agents} agents has too many outcomes for an exact form")
         found: dict[int, list[Any]] = {}

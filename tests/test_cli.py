@@ -461,7 +461,7 @@ def test_monte_carlo_shows_its_error():
 def test_compare(tmp_path):
     done = run("compare", "--steps", "2", "--link", "0.25,0.75", "--runs", "100", "--plot", str(tmp_path / "c.png"))
     assert "Δ: difference from general, signed" in done.stdout
-    assert "0.25   2    39.379       42.571   +3.19" in done.stdout
+    assert "0.25   2    39.379    42.571 +3.19" in done.stdout
     assert max(map(len, done.stdout.splitlines())) <= 80
     assert (tmp_path / "c.png").stat().st_size > 10_000
     result = strict_json(run("compare", "--steps", "2", "--methods", "simplified,naive", "--format", "json").stdout)
@@ -472,7 +472,7 @@ def test_crosscheck_verdict_is_the_exit_code(tmp_path):
     rows = ["run,step,link,covariance", *(f"{r},1,1,33.3333333333\n{r},2,1,21.2121212121" for r in range(20))]
     (tmp_path / "good.csv").write_text("\n".join(rows))
     done = run("crosscheck", str(tmp_path / "good.csv"))
-    assert "AGREE (largest |z| over 2 cells" in done.stdout.replace("\n", " ")
+    assert "AGREE (smallest p over 2 cells" in done.stdout.replace("\n", " ")
     (tmp_path / "bad.csv").write_text("\n".join(rows).replace("21.21", "21.61"))
     done = run("crosscheck", str(tmp_path / "bad.csv"), "--format", "json", code=1)
     assert strict_json(done.stdout)["verdict"] == "disagree"
@@ -500,7 +500,7 @@ def test_crosscheck_by_case(tmp_path):
 def test_graph(tmp_path):
     text = run("graph", "--agent", "3", "--step", "4", "--scenario", "thesis-transient").stdout
     assert text.startswith("agent 3 at step 4 fuses {(2,k4), (3,k4)}\n")
-    assert "claimed covariance, trace: 23.229" in text
+    assert "claimed covariance, variance of x: 23.229" in text
     assert run("graph", "--agent", "3", "--step", "4", "--format", "dot").stdout.startswith(
         'digraph "agent 3 at step 4" {'
     )

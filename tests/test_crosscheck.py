@@ -94,6 +94,49 @@ def test_rare_outcomes_that_were_not_seen_are_reckoned_with():
     assert check_results(flat, prediction, metric("trace", prediction.scenario.model)).agrees
 
 
+def simulated(scenario, link, runs, seed, of=lambda P: np.trace(P, axis1=-2, axis2=-1)):
+    """Honest results of one link probability."""
+    s = sf.predict(scenario, [link], method="monte-carlo", runs=runs, seed=seed, workers=1).sampled.sample
+    P = of(s.values)[s.which]
+    _, run, step, agent = (i.ravel() for i in np.indices(P.shape))
+    return Results(
+        "simulator", np.full(P.size, str(link)), step + 1, agent + 1, P.ravel(), run, None, None, None, np.arange(P.size), "line", 0.0
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("architecture", "agents", "link", "runs"),
+    [("ad-hoc", 3, 0.98, 2), ("ad-hoc", 2, 0.98, 200), ("broadcast", 2, 0.02, 200), ("ad-hoc", 3, 0.005, 100), ("cyclic", 3, 0.99, 20)],
+)  # fmt: skip
+def test_few_runs_and_rare_outcomes_raise_no_false_alarm(architecture, agents, link, runs):
+    """300 honest samples far from normal; at the level 0.001 three alarms would be one too many in a thousand."""
+    scenario = sf.load_scenario(architecture=architecture, agents=agents, steps=3)
+    prediction = sf.predict(scenario, [link], method="general")
+    m = metric("trace", scenario.model)
+    wrong = [not check_results(simulated(scenario, link, runs, seed), prediction, m).agrees for seed in range(300)]
+    assert sum(wrong) <= 2
+
+
+@pytest.mark.parametrize("name", ["std:x", "det"])
+def test_metrics_that_are_not_linear(name):
+    """The mean of a metric over the outcomes is not the metric of the mean."""
+    scenario = sf.load_scenario(steps=3)
+    m = metric(name, scenario.model)
+    results = simulated(scenario, 0.5, 5000, 4, m.of)
+    assert check_results(results, sf.predict(scenario, [0.5], method="general"), m).agrees
+
+
+def test_rounded_files_of_any_spread_pass(tmp_path):
+    scenario = sf.load_scenario(steps=3)
+    prediction, m = sf.predict(scenario, [0.98], method="general"), metric("trace", scenario.model)
+    honest = simulated(scenario, 0.98, 5000, 5)
+    for digits in (0, 1, 2):
+        rows = zip(honest.run, honest.agent, honest.step, honest.covariance, strict=True)
+        text = "run,agent,step,link,covariance\n" + "".join(f"{r},{a},{k},0.98,{P:.{digits}f}\n" for r, a, k, P in rows)
+        (tmp_path / "r.csv").write_text(text)
+        assert check_results(read_results(tmp_path / "r.csv"), prediction, m).agrees
+
+
 def test_means(samples, prediction, tmp_path):
     P = samples[:, :5000].mean(axis=1)
     rows = [

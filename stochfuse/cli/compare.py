@@ -11,7 +11,6 @@ from stochfuse.cli.options import (
     AgentsOption,
     ArchitectureOption,
     DigitsOption,
-    Estimator,
     EstimatorOption,
     Format,
     FormatOption,
@@ -32,6 +31,7 @@ from stochfuse.cli.options import (
     check_files,
     chosen_format,
     load,
+    settings_for,
 )
 
 
@@ -50,14 +50,14 @@ def compare(
     r: ROption = None,
     p0: P0Option = None,
     architecture: ArchitectureOption = None,
-    estimator: EstimatorOption = Estimator.local_fusion_graph,
+    estimator: EstimatorOption = None,
     metric: MetricOption = None,
     agent: AgentOption = "mean",
     relative: Annotated[bool, typer.Option("--relative", help="Differences in per cent of the reference.")] = False,
-    max_graphs: MaxGraphsOption = 100_000,
+    max_graphs: MaxGraphsOption = None,
     prune: PruneOption = False,
-    runs: RunsOption = 1000,
-    seed: SeedOption = 1,
+    runs: RunsOption = None,
+    seed: SeedOption = None,
     workers: WorkersOption = None,
     digits: DigitsOption = 5,
     format: FormatOption = None,
@@ -76,23 +76,21 @@ def compare(
     from stochfuse.report.export import terminal_width, to_json, write_text
     from stochfuse.report.predictions import View
 
-    check_files(output, plot)
+    check_files(output, plot, scenario)
+    chosen_methods = [name.strip() for name in methods.split(",")]
+    settings = settings_for(
+        chosen_methods,
+        estimator=estimator,
+        max_graphs=max_graphs,
+        prune=prune,
+        runs=runs,
+        seed=seed,
+        workers=workers,
+    )
     given, links = load(scenario, agents, steps, architecture, q, r, p0, link)
     chosen = metric_of(metric or given.metric or "trace", given.model)
     with shown() as progress:
-        found = run(
-            given,
-            links,
-            [name.strip() for name in methods.split(",")],
-            reference,
-            estimator=estimator.value,
-            max_graphs=max_graphs,
-            prune=prune,
-            runs=runs,
-            seed=seed,
-            workers=workers,
-            progress=progress,
-        )
+        found = run(given, links, chosen_methods, reference, progress=progress, **settings)
     whose = int(agent) if agent.isdigit() else agent
     view = comparisons.ComparisonView(
         found, tuple(View(p, chosen, whose, None, digits) for p in found.predictions), relative

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -25,6 +25,7 @@ from stochfuse.cli.options import (
     check_files,
     chosen_format,
     load,
+    settings_for,
 )
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ def crosscheck(
     alpha: Annotated[
         float, typer.Option(help="Probability that a right simulator is called wrong, over all cells together.")
     ] = 0.001,
-    max_graphs: MaxGraphsOption = 100_000,
+    max_graphs: MaxGraphsOption = None,
     prune: PruneOption = False,
     digits: DigitsOption = 5,
     format: FormatOption = None,
@@ -82,7 +83,8 @@ def crosscheck(
     from stochfuse.report.export import terminal_width, to_json, write_text
     from stochfuse.report.predictions import View
 
-    check_files(output, None)
+    check_files(output, None, file, scenario)
+    settings = settings_for([method.value], max_graphs=max_graphs, prune=prune)
     if not 0 < alpha < 1:
         raise UsageError(f"--alpha: expected a probability between 0 and 1, got {alpha:g}")
     if file == scenario == "-":
@@ -97,7 +99,7 @@ def crosscheck(
         )
     given = given.until(last)
     chosen = metric_of(metric or given.metric or "trace", given.model)
-    prediction = _predict(given, _rows(results, given), method, max_graphs, prune)
+    prediction = _predict(given, _rows(results, given), method, settings)
     verdict = check_results(results, prediction, chosen, alpha)
     shown = crosschecks.CrosscheckView(results, View(prediction, chosen, "mean", None, digits), verdict)
     for note in prediction.notes:
@@ -150,12 +152,16 @@ def _rows(results: Results, scenario: Scenario) -> LinkRows:
             known = f", or a case ({', '.join(cases)})" if cases else ""
             raise ResultsError(f"{where}, column 'link': expected a probability between 0 and 1{known}, got '{link}'")
         values.append(value)
+    if scenario.network.link is not None or cases:
+        typer.echo(
+            "note: the file's link probabilities are taken for all links; the scenario's own are not used", err=True
+        )
     return link_rows(scenario, values)
 
 
-def _predict(scenario: Scenario, rows: LinkRows, method: Against, max_graphs: int, prune: bool):
+def _predict(scenario: Scenario, rows: LinkRows, method: Against, settings: dict[str, Any]):
     from stochfuse.cli.progress import shown
     from stochfuse.methods import predict
 
     with shown() as progress:
-        return predict(scenario, rows, method.value, max_graphs=max_graphs, prune=prune, progress=progress)
+        return predict(scenario, rows, method.value, progress=progress, **settings)

@@ -42,32 +42,34 @@ def graph(
 
     Without a history: the worked example of the thesis' section 2.4.
     """
-    import numpy as np
-
     from stochfuse.errors import UsageError
     from stochfuse.fusion_graph import FusionGraph, load_history
+    from stochfuse.metrics import metric as metric_of
     from stochfuse.report import fusion_graph as report
     from stochfuse.report.export import terminal_width, to_json, write_text
 
-    check_files(output, plot)
+    check_files(output, plot, history, scenario or "")
     made = FusionGraph(load_history(history), shared=shared)
     agents = range(1, made.history.agents + 1) if agent is None else [agent]
     steps = range(1, made.history.steps + 1) if step is None else [step]
     explanations = [made.explain(i, k) for k in steps for i in agents]
     if (plot is not None or format is GraphFormat.dot) and (agent is None or step is None):
         raise UsageError("a drawing shows one agent at one step: expected --agent and --step")
-    traces = None
+    values = None
     if scenario is not None:
         from stochfuse.scenario import load_scenario
 
-        given = load_scenario(scenario, agents=made.history.agents, steps=made.history.steps)
-        traces = {node: float(np.trace(estimate.P)) for node, estimate in made.estimates(given).items()}
+        n, steps = made.history.agents, made.history.steps
+        given = load_scenario(scenario, agents=n, steps=steps, uniform_link=True)
+        metric = metric_of(given.metric or "trace", given.model)
+        claimed = {node: float(metric.of(estimate.P)) for node, estimate in made.estimates(given).items()}
+        values = report.Claimed(metric, claimed)
     if plot is not None:
         report.plot(made, explanations[0], plot)
     if format is GraphFormat.json:
-        text = to_json(report.to_mapping(made, explanations, traces))
+        text = to_json(report.to_mapping(made, explanations, values))
     elif format is GraphFormat.dot:
         text = report.to_dot(made, explanations[0])
     else:
-        text = report.to_text(explanations, traces, terminal_width())
+        text = report.to_text(explanations, values, terminal_width())
     write_text(text, output)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -85,9 +86,20 @@ AgentOption = Annotated[
     str,
     typer.Option(metavar="N", help="Whose covariance where agents differ: mean, worst, best or an agent's number."),
 ]
-EstimatorOption = Annotated[Estimator, typer.Option(help="general, monte-carlo: what the agents do with what arrives.")]
+EstimatorOption = Annotated[
+    Estimator | None,
+    typer.Option(
+        help="general, monte-carlo: what the agents do with what arrives; default: local-fusion-graph.",
+        show_default=False,
+    ),
+]
 MaxGraphsOption = Annotated[
-    int, typer.Option(min=1, help="general, naive: different graphs that may be carried from step to step.")
+    int | None,
+    typer.Option(
+        min=1,
+        help="general, naive: different graphs that may be carried from step to step; default: 100000.",
+        show_default=False,
+    ),
 ]
 PruneOption = Annotated[
     bool,
@@ -95,8 +107,14 @@ PruneOption = Annotated[
         "--prune", help="general, naive: beyond --max-graphs leave the least likely out, and say how likely they were."
     ),
 ]
-RunsOption = Annotated[int, typer.Option(min=2, help="monte-carlo: independent runs per link probability.")]
-SeedOption = Annotated[int, typer.Option(min=0, help="monte-carlo: seed of the random numbers.")]
+RunsOption = Annotated[
+    int | None,
+    typer.Option(min=2, help="monte-carlo: independent runs per link probability; default: 1000.", show_default=False),
+]
+SeedOption = Annotated[
+    int | None,
+    typer.Option(min=0, help="monte-carlo: seed of the random numbers; default: 1.", show_default=False),
+]
 WorkersOption = Annotated[
     int | None,
     typer.Option(min=1, help="monte-carlo: processes; default: one for small samples, else one per processor."),
@@ -132,8 +150,37 @@ def load(
     return given, links
 
 
-def check_files(output: Path | None, plot: Path | None) -> None:
-    """Raise UsageError early if a file can never be written, or if two are one."""
+APPLIES_TO = {
+    "estimator": ("general", "monte-carlo"),
+    "max_graphs": ("general", "naive"),
+    "prune": ("general", "naive"),
+    "runs": ("monte-carlo",),
+    "seed": ("monte-carlo",),
+    "workers": ("monte-carlo",),
+}
+"""Methods that each setting means something to."""
+
+
+def settings_for(methods: Sequence[str], **settings: Any) -> dict[str, Any]:
+    """Return the settings that were given.
+
+    Raises
+    ------
+    UsageError
+        If none of the methods has any use for one of them.
+    """
+    from stochfuse.errors import UsageError
+
+    given = {name: value for name, value in settings.items() if value is not None and value is not False}
+    for name in given:
+        if not set(APPLIES_TO[name]) & set(methods):
+            option = "--" + name.replace("_", "-")
+            raise UsageError(f"{option}: expected method {' or '.join(APPLIES_TO[name])}, got {', '.join(methods)}")
+    return {name: value.value if isinstance(value, StrEnum) else value for name, value in given.items()}
+
+
+def check_files(output: Path | None, plot: Path | None, *inputs: str) -> None:
+    """Raise UsageError early if a file can never be written, if two are one, or if one is an input."""
     from stochfuse.errors import UsageError
     from stochfuse.report.export import PLOT_SUFFIXES, check_writable
 
@@ -141,6 +188,10 @@ def check_files(output: Path | None, plot: Path | None) -> None:
     check_writable(plot, PLOT_SUFFIXES)
     if plot is not None and output is not None and plot.resolve() == output.resolve():
         raise UsageError(f"--output and --plot: expected different files, got {output} for both")
+    for option, file in (("--output", output), ("--plot", plot)):
+        for source in inputs:
+            if file is not None and file.exists() and Path(source).exists() and file.samefile(source):
+                raise UsageError(f"{option}: expected another file than the input {source}, which it would overwrite")
 
 
 def parse_link(text: str) -> list[float]:

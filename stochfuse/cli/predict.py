@@ -14,7 +14,6 @@ from stochfuse.cli.options import (
     AgentsOption,
     ArchitectureOption,
     DigitsOption,
-    Estimator,
     EstimatorOption,
     Format,
     FormatOption,
@@ -35,6 +34,7 @@ from stochfuse.cli.options import (
     check_files,
     chosen_format,
     load,
+    settings_for,
 )
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def predict(
     p0: P0Option = None,
     architecture: ArchitectureOption = None,
     method: Annotated[Method, typer.Option(help="How to average over which messages arrive.")] = Method.simplified,
-    estimator: EstimatorOption = Estimator.local_fusion_graph,
+    estimator: EstimatorOption = None,
     quantity: Annotated[Quantity, typer.Option(help="Which covariance.")] = Quantity.claimed,
     metric: MetricOption = None,
     statistic: Annotated[
@@ -82,10 +82,10 @@ def predict(
     steady: Annotated[
         bool, typer.Option("--steady", help="Add the steady state, P = g(P), with a proved bound (simplified).")
     ] = False,
-    max_graphs: MaxGraphsOption = 100_000,
+    max_graphs: MaxGraphsOption = None,
     prune: PruneOption = False,
-    runs: RunsOption = 1000,
-    seed: SeedOption = 1,
+    runs: RunsOption = None,
+    seed: SeedOption = None,
     workers: WorkersOption = None,
     digits: DigitsOption = 5,
     format: FormatOption = None,
@@ -101,7 +101,7 @@ def predict(
     from stochfuse.metrics import metric as metric_of
     from stochfuse.report.predictions import View
 
-    check_files(output, plot)
+    check_files(output, plot, scenario)
     given, links = load(scenario, agents, steps, architecture, q, r, p0, link)
     chosen = metric_of(metric or given.metric or "trace", given.model)
     if statistic != "mean":
@@ -114,16 +114,18 @@ def predict(
         kind, _ = parse_statistic(statistic)
         if kind == "derivative" and not chosen.linear:
             raise UsageError(f"derivative: expected metric trace or var:STATE, got '{chosen.name}'")
-    settings: dict[str, Any] = {"steady": steady}
-    if method is not Method.simplified:
-        settings |= {
-            "estimator": estimator.value,
-            "max_graphs": max_graphs,
-            "prune": prune,
-            "runs": runs,
-            "seed": seed,
-            "workers": workers,
-        }
+    settings = {
+        "steady": steady,
+        **settings_for(
+            [method.value],
+            estimator=estimator,
+            max_graphs=max_graphs,
+            prune=prune,
+            runs=runs,
+            seed=seed,
+            workers=workers,
+        ),
+    }
     with _progress(method) as settings["progress"]:
         prediction = run(given, links, method.value, quantity.value, **settings)
         baseline = run(given, [0.0], method.value, quantity.value, **settings) if normalise else None
@@ -146,6 +148,8 @@ def _progress(method: Method) -> AbstractContextManager[Any]:
 
 
 def _warn(view: View) -> None:
+    if view.prediction.sampled is not None and view.agent in ("worst", "best") and not view.prediction.alike:
+        typer.echo(f"note: which agent is the {view.agent} is judged by the same sample: the value is biased", err=True)
     for note in view.prediction.notes:
         typer.echo(f"note: {note}", err=True)
     if view.metric.mixed and not view.baseline:

@@ -21,7 +21,10 @@ class Shown(Progress):
 
     def expect(self, outcomes: int, graphs: int) -> None:
         """Say how much work there is."""
-        typer.echo(f"note: {outcomes:,} outcomes; about {graphs:,} different graphs to carry", err=True)
+        from stochfuse.report.predictions import counted
+
+        work = f"{counted(outcomes, 'outcome')}; about {counted(graphs, 'different graph')} to carry"
+        typer.echo(f"note: {work}", err=True)
 
     def advance(self, step: int, done: int, total: int) -> None:
         """Move the bar."""

@@ -156,14 +156,20 @@ def _enumerate(estimator: Estimator, request: Request, progress: Progress) -> St
         if step < steps or not two_steps:
             left = steps - step + 1
             expected = _expected(sizes, len(layer) * number[step - 1] // number[step - 2], len(estimator.relabellings))
-            _check_size(expected, before, len(fates(request.delay, left)), number[steps], step, request)
+            in_the_end = _extrapolated(sizes, expected, steps - step - two_steps)
+            _check_exchange(before, len(fates(request.delay, left)), number[steps], request)
+            if expected > LONG or in_the_end > 10 * request.most:
+                # an extrapolation may be off by a few times; what is far beyond the limit need not be begun
+                beyond = in_the_end if in_the_end > 10 * request.most else expected
+                _check_size(beyond, number[steps], request)
             if not announced and expected > LONG:
-                progress.expect(number[steps], _extrapolated(sizes, expected, steps - step - two_steps))
+                progress.expect(number[steps], in_the_end)
                 announced = True
             possible = outcomes(before, n, request.delay, left, weights)
             layer = _next_layer(estimator, layer, possible, step - 1, request, progress)
             if request.prune and len(layer) > request.most:
                 layer = _likeliest(layer, request.most)
+            _check_size(len(layer), number[steps], request)
             sizes.append(len(layer))
         if not two_steps:
             endings.append(_ending(estimator, layer, last, degree, events_up_to[step - 1], step, request))
@@ -197,8 +203,15 @@ def _next_layer(
 
 
 def _likeliest(layer: dict[Any, np.ndarray], most: int) -> dict[Any, np.ndarray]:
-    order = sorted(layer, key=lambda state: -layer[state].max())
-    return {state: layer[state] for state in order[:most]}
+    """Return the likeliest states, every row's own likeliest in turn."""
+    states, weights = list(layer), np.array(list(layer.values()))
+    rank = np.argsort(np.argsort(-weights, axis=0, kind="stable"), axis=0, kind="stable").min(axis=1)
+    kept = np.sort(np.argsort(rank, kind="stable")[:most])
+    if (weights[kept].sum(axis=0) <= 0).any():
+        raise TooManyError(
+            f"--max-graphs {most}: too few to keep an outcome for every row; expected more, or fewer rows"
+        )
+    return {states[i]: layer[states[i]] for i in kept}
 
 
 def _expected(sizes: list[int], candidates: int, relabellings: int) -> int:
@@ -212,18 +225,23 @@ def _extrapolated(sizes: list[int], expected: int, further: int) -> int:
     return round(expected * (expected / sizes[-1]) ** max(0, further))
 
 
-def _check_size(expected: int, drawn: list[Event], options: int, number: int, step: int, request: Request) -> None:
-    instead = "use --method optimal or --method monte-carlo, fewer steps or fewer agents"
+def _check_exchange(drawn: list[Event], options: int, number: int, request: Request) -> None:
     if options ** len(drawn) > MOST_CELLS >> 4:
         raise TooManyError(
-            f"one exchange of {request.agents} agents has {options ** len(drawn):.3g} outcomes, the whole "
+            f"one exchange of {request.agents} agents has {float(options) ** len(drawn):.3g} outcomes, the whole "
             f"{number:.3g}, "
-            f"too many to list: {instead}"
+            "too many to list: use --method optimal or --method monte-carlo, fewer steps or fewer agents"
         )
+
+
+def _check_size(expected: int, number: int, request: Request) -> None:
     if expected > request.most and not request.prune:
         raise TooManyError(
-            f"{number:.3g} outcomes make about {expected} different graphs by step {step}, more than --max-graphs "
-            f"{request.most}: raise it, leave the least likely out with --prune, or {instead}"
+            f"{number:.3g} outcomes make about {expected} different graphs, more than --max-graphs "
+            f"{request.most}: raise it, "
+            "leave the least likely out with --prune, or use --method optimal or --method monte-carlo, fewer "
+            "steps or fewer "
+            "agents"
         )
 
 
@@ -238,6 +256,13 @@ def _ending(
 ) -> Ending:
     """Carry out the last exchange for every state: one view per agent."""
     weights, views = request.weights, []
+    most = max(len(concerning(last, [agent])) for group in request.groups for agent in group)
+    if most > MOST_CELLS.bit_length() // 2 + 2:
+        raise TooManyError(
+            f"an agent of {request.agents} can hear {2.0**most:.3g} different sets of others, too many to list: "
+            f"use --method "
+            "optimal or --method monte-carlo, or fewer agents"
+        )
     exchanges = layer if request.plain else [estimator.exchange(state) for state in layer]
     for group, agents in enumerate(request.groups):
         for agent in agents:
@@ -374,7 +399,7 @@ class _Table:
         return [*locals_, *reversed(brought), -1]
 
 
-def claimed(ending: Ending, values: Information) -> Iterator[tuple[View, slice, Estimate]]:
+def claimed(ending: Ending, values: Information) -> Iterator[tuple[View, slice, Estimate, np.ndarray]]:
     """What is claimed in every outcome, a chunk of states at a time.
 
     Parameters
@@ -383,8 +408,8 @@ def claimed(ending: Ending, values: Information) -> Iterator[tuple[View, slice, 
 
     Yields
     ------
-    view, states, estimate
-        Estimate of P (states, cells, d, d) and, if the values have states, x (states, cells, d, 1).
+    view, states, estimate, Y
+        Estimate of P (states, cells, d, d) and, if the values have states, x (states, cells, d, 1); P's information.
     """
     d = values.Y.shape[-1]
     Y = np.concatenate([values.Y, np.zeros((1, d, d))])
@@ -398,7 +423,7 @@ def claimed(ending: Ending, values: Information) -> Iterator[tuple[View, slice, 
             total = _summed(Y, ids, view.terms)
             check_definite(total, ending.step)
             information = Information(None if y is None else _summed(y, ids, view.terms), total)
-            yield view, states, from_information(information)
+            yield view, states, from_information(information), total
 
 
 def _summed(values: np.ndarray, ids: np.ndarray, terms: tuple[tuple[int, np.ndarray], ...]) -> np.ndarray:
@@ -408,7 +433,7 @@ def _summed(values: np.ndarray, ids: np.ndarray, terms: tuple[tuple[int, np.ndar
     return total
 
 
-def expectation(ending: Ending, values: Information, weights: Weights, groups: int) -> list[Estimate]:
+def expectation(ending: Ending, values: Information, weights: Weights, groups: int) -> tuple[list[Estimate], float]:
     """Expected state and covariance per group of agents, (48)/(49), on the weights' axis.
 
     Returns
@@ -416,9 +441,13 @@ def expectation(ending: Ending, values: Information, weights: Weights, groups: i
     list of Estimate
         P of shape (width, d, d): coefficients A_c of the polynomial in µ, or one matrix per row; x (width, d, 1) or
         None.
+    float
+        Largest P_ii Y_ii of any outcome: by how much rounding is magnified when its information is inverted.
     """
+    magnified = 1.0
     sums: list[list[Any]] = [[None, None] for _ in range(groups)]
-    for view, states, estimate in claimed(ending, values):
+    for view, states, estimate, Y in claimed(ending, values):
+        magnified = max(magnified, float((_diagonal(estimate.P) * _diagonal(Y)).max()))
         for place, value in enumerate(estimate):
             if value is None:
                 continue
@@ -429,4 +458,8 @@ def expectation(ending: Ending, values: Information, weights: Weights, groups: i
                     part = weights.completed(weights.weighed(total, share), ending.events)
                     known = sums[group][place]
                     sums[group][place] = part if known is None else known + part
-    return [Estimate(*pair) for pair in sums]
+    return [Estimate(*pair) for pair in sums], magnified
+
+
+def _diagonal(A: np.ndarray) -> np.ndarray:
+    return np.diagonal(A, axis1=-2, axis2=-1)

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, nullcontext
 from itertools import repeat
+from math import log2
 from multiprocessing import active_children
 from typing import Any, NamedTuple
 
@@ -218,7 +219,7 @@ def _moved(fates: np.ndarray, events: Sequence[Event], place_of: np.ndarray) -> 
 def _distinct(exchange_of: np.ndarray, fates: np.ndarray, options: int) -> tuple[np.ndarray, np.ndarray]:
     """Different (exchange, fates) pairs, in the order of exchanges, and the number of each run's pair."""
     table = np.concatenate([exchange_of[:, None], fates], axis=1)
-    if (exchange_of.max() + 1.0) * float(options) ** fates.shape[1] < 2**62:
+    if log2(exchange_of.max() + 1) + fates.shape[1] * log2(options) < 62:
         code = exchange_of.copy()
         for fate in fates.T:
             code = code * options + fate

@@ -67,18 +67,15 @@ def compare_table(view: ComparisonView) -> Table:
     """Return rows of link probability and step, columns of methods."""
     p, digits = view.comparison.reference, view.views[0].digits
     values, differences = view.values(), view.differences()
-    columns = [p.method]
-    for method in view.comparison.methods[1:]:
-        columns += [method, "Δ %" if view.relative else "Δ"]
+    columns = [p.method, *(f"{m}, Δ{' %' if view.relative else ''}" for m in view.comparison.methods[1:])]
     rows = []
     for i, µ in enumerate(p.link):
         name = () if p.cases is None else (p.cases[i],)
         for k, step in enumerate(p.steps):
             cells = []
             for m, value in enumerate(values[:, i, k]):
-                cells.append(number(value, digits))
-                if m:
-                    cells.append(_signed(differences[m, i, k], value, digits) + _error(view, m, i, k))
+                difference = f" {_signed(differences[m, i, k], value, digits)}" if m else ""
+                cells.append(number(value, digits) + difference + _error(view, m, i, k))
             rows.append((*name, f"{µ:.6g}", str(step), *cells))
     keys = ("µ", "k") if p.cases is None else ("links", "mean µ", "k")
     return Table(view.titles, keys, tuple(columns), tuple(rows))
@@ -93,7 +90,7 @@ def _error(view: ComparisonView, method: int, row: int, step: int) -> str:
     errors = view.errors(method)
     if errors is None:
         return ""
-    scale = 100.0 / view.values()[0, row, step] if view.relative else 1.0
+    scale = 100.0 / view.values()[0, row, step] if view.relative and method else 1.0
     return f" ±{scale * errors[row, step]:.2g}"
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from stochfuse import __version__
 from stochfuse.crosscheck import Cell, Results, Verdict
-from stochfuse.report.predictions import View
+from stochfuse.report.predictions import View, counted
 from stochfuse.report.table import Table, number, to_csv
 
 SCHEMA = "stochfuse.crosscheck/1"
@@ -29,10 +29,11 @@ class CrosscheckView:
         v = self.verdict
         off = [cell for cell in v.cells if not cell.agrees]
         together = "" if v.p_together is None else f", p of all cells together {_p(v.p_together)}"
-        text = f"largest |z| over {len(v.cells)} cells: corrected p {_p(v.p_largest)}{together}; level {v.alpha:g}"
+        cells = counted(len(v.cells), "cell")
+        text = f"smallest p over {cells}, corrected: {_p(v.p_largest)}{together}; level {v.alpha:g}"
         if v.agrees:
             return f"AGREE ({text})"
-        where = f"{len(off)} of {len(v.cells)} cells differ" if off else "no single cell, but all of them together"
+        where = f"{len(off)} of {cells} differ" if off else "no single cell, but all of them together"
         return f"DISAGREE: {where} ({text})"
 
     @property
@@ -52,7 +53,10 @@ def _p(p: float) -> str:
 
 
 def _agents(cell: Cell) -> str:
-    return "-".join(map(str, sorted({cell.agents[0], cell.agents[-1]}))) if cell.agents else ""
+    first, last = cell.agents[0], cell.agents[-1]
+    if cell.agents == tuple(range(first, last + 1)):
+        return str(first) if first == last else f"{first}-{last}"
+    return ",".join(map(str, cell.agents))
 
 
 def crosscheck_table(shown: CrosscheckView) -> Table:
@@ -69,7 +73,7 @@ def crosscheck_table(shown: CrosscheckView) -> Table:
                 number(cell.mean, digits),
                 f"{cell.error:.2g}",
                 number(cell.expected, digits),
-                f"{cell.z:+.2f}" if np.isfinite(cell.z) else "∞",
+                f"{cell.z:+.2f}" if np.isfinite(cell.z) else "+∞" if cell.z > 0 else "−∞",
                 _p(cell.p) + ("" if cell.agrees else " differs"),
             )
         )

@@ -6,18 +6,26 @@ import textwrap
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from stochfuse import __version__
 from stochfuse.fusion_graph import Explanation, FusionGraph, Node, Term
+from stochfuse.metrics import Metric
 from stochfuse.report.export import write_file
 from stochfuse.report.plot import figure_class
 from stochfuse.report.table import number
 
 SCHEMA = "stochfuse.fusion-graph/1"
 REMOVED, OWN, OTHER = "#f4b183", "#9dc3e6", "#ffffff"
+
+
+class Claimed(NamedTuple):
+    """A metric of every fused estimate's claimed covariance."""
+
+    metric: Metric
+    values: Mapping[Node, float]
 
 
 def name(node: Node) -> str:
@@ -30,9 +38,7 @@ def names(nodes: tuple[Node, ...]) -> str:
     return name(nodes[0]) if len(nodes) == 1 else "{" + ", ".join(map(name, nodes)) + "}"
 
 
-def to_text(
-    explanations: list[Explanation], traces: Mapping[Node, float] | None = None, width: int | None = None
-) -> str:
+def to_text(explanations: list[Explanation], claimed: Claimed | None = None, width: int | None = None) -> str:
     """Every fusion in words, one block each, wrapped to a width."""
     blocks = []
     for e in explanations:
@@ -40,8 +46,10 @@ def to_text(
         if e.superseded:
             lines.append(f"  {names(e.superseded)} arrived too, but was known already: it changes nothing")
         lines += _lines(e.terms, 2)
-        if traces is not None:
-            lines.append(f"  claimed covariance, trace: {number(traces[e.agent, e.step])}")
+        if claimed is not None:
+            unit = f" {claimed.metric.unit}" if claimed.metric.unit else ""
+            value = number(claimed.values[e.agent, e.step])
+            lines.append(f"  claimed covariance, {claimed.metric.label}: {value}{unit}")
         blocks.append("\n".join(lines if width is None else map(partial(_wrapped, width=width), lines)))
     return "\n\n".join(blocks) + "\n"
 
@@ -68,13 +76,12 @@ def _lines(terms: tuple[Term, ...], indent: int) -> list[str]:
     return lines
 
 
-def to_mapping(
-    graph: FusionGraph, explanations: list[Explanation], traces: Mapping[Node, float] | None
-) -> dict[str, Any]:
+def to_mapping(graph: FusionGraph, explanations: list[Explanation], claimed: Claimed | None) -> dict[str, Any]:
     """Return an object with nodes, edges and what explains every fusion."""
     return {
         "schema": SCHEMA,
         "version": __version__,
+        **({} if claimed is None else {"metric": claimed.metric.name}),
         "agents": graph.history.agents,
         "steps": graph.history.steps,
         "nodes": [list(node) for node in graph.nodes],
@@ -86,7 +93,7 @@ def to_mapping(
                 "fused": [list(n) for n in e.fused],
                 "superseded": [list(n) for n in e.superseded],
                 "terms": [_term(t) for t in e.terms],
-                **({} if traces is None else {"claimed_trace": traces[e.agent, e.step]}),
+                **({} if claimed is None else {"claimed": claimed.values[e.agent, e.step]}),
             }
             for e in explanations
         ],

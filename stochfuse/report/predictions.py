@@ -31,8 +31,8 @@ ESTIMATOR_TITLES = {
 STATISTICS = {
     "variance": "variance over the outcomes of the {what}",
     "std": "standard deviation over the outcomes of the {what}",
-    "quantile": "{number:g}-quantile over the outcomes of the {what}",
-    "at-most": "probability that the {what} is at most {number:g}{unit}",
+    "quantile": "{number}-quantile over the outcomes of the {what}",
+    "at-most": "probability that the {what} is at most {number}{unit}",
     "derivative": "derivative in µ of the expected {what}",
 }
 LEVEL = 0.95
@@ -107,7 +107,7 @@ class View:
             return f"Expected {p.quantity} {p.stage} covariance: {self.metric.label}{unit}"
         kind, number = parse_statistic(self.statistic)
         own = f" {self.metric.unit}" if self.metric.unit else ""
-        text = STATISTICS[kind].format(what=self.metric.label, number=number, unit=own)
+        text = STATISTICS[kind].format(what=self.metric.label, number=f"{number:.12g}", unit=own)
         return f"{p.quantity.capitalize()} {p.stage} covariance: {text}" + ("" if kind == "at-most" else unit)
 
     @property
@@ -121,8 +121,9 @@ class View:
     def _of(self) -> str:
         if self.prediction.alike:
             return "every agent alike" if len(self.prediction.group_of) > 1 else "alone"
+        random = self.statistic not in ("mean", "derivative")
         texts = {
-            "mean": "covariance averaged over the agents",
+            "mean": "of an agent picked at random" if random else "covariance averaged over the agents",
             "worst": "the agent with the largest value",
             "best": "the agent with the smallest value",
         }
@@ -141,12 +142,20 @@ class View:
         if p.sampled is not None:
             return f"sampled, {p.sampled.runs:,} runs, seed {p.meta['seed']}; ± one standard error"
         if p.method == "optimal":
-            paths = f"{p.meta['paths']:,} paths" if p.meta["paths"] < 1e9 else f"{p.meta['paths']:.3g} paths"
+            paths = counted(p.meta["paths"], "path")
             return f"exact, {paths}" if p.nature == "exact" else f"enclosed in bounds, {paths}"
         if p.outcomes is None:
             return "approximate (mean field)"
-        everything = f"{p.meta['outcomes']:,} outcomes"
-        return f"exact, {everything}" if p.nature == "exact" else f"approximate, the likeliest of {everything}"
+        everything = counted(p.meta["outcomes"], "outcome")
+        if p.nature == "exact":
+            return f"exact, {everything}"
+        return f"approximate, {everything} less those of probability up to {np.max(p.meta['left_out']):.2g}"
+
+
+def counted(number: int, what: str) -> str:
+    """Return a number with its noun."""
+    shown = f"{number:,}" if number < 10**15 else f"{number:.3g}"
+    return f"{shown} {what}{'s' * (number != 1)}"
 
 
 def _finite(values: np.ndarray) -> np.ndarray:
