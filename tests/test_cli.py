@@ -523,9 +523,28 @@ def test_reproduce_timing():
     assert all(row["here_s"] > 0 for row in rows)
 
 
+def test_an_input_is_never_overwritten(tmp_path):
+    (tmp_path / "r.csv").write_text("run,step,link,covariance\n1,1,0,100\n2,1,0,100\n")
+    run("scenario", "new", "--output", str(tmp_path / "s.toml"))
+    for arguments in (
+        ["crosscheck", "r.csv", "-o", "r.csv"],
+        ["predict", "s.toml", "-o", "s.toml"],
+        ["compare", "s.toml", "-o", "s.toml"],
+    ):
+        before = (tmp_path / arguments[-1]).read_text()
+        assert "which it would overwrite" in run(*arguments, code=2, cwd=tmp_path).stderr
+        assert (tmp_path / arguments[-1]).read_text() == before
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["predict", "--estimator", "naive"], "--estimator: expected method general or monte-carlo, got simplified"),
+        (["predict", "--method", "general", "--runs", "5"], "--runs: expected method monte-carlo, got general"),
+        (["predict", "--method", "monte-carlo", "--prune"], "--prune: expected method general or naive, got monte-carlo"),
+        (["compare", "--methods", "general,naive", "--seed", "5"], "--seed: expected method monte-carlo, got general, naive"),
+        (["crosscheck", "nowhere.csv", "--method", "simplified", "--max-graphs", "5"], "--max-graphs: expected method general or naive, got simplified"),
+        (["compare", "fcs-demo"], "general cannot be compared here, leave it out of the methods"),
         (["predict", "--steady", "--method", "general"], "steady: expected method simplified, got general"),
         (["predict", "--statistic", "std"], "--statistic std: expected --method general or naive, got simplified"),
         (["predict", "--method", "general", "--statistic", "mode"], "statistic: expected mean, variance, std, quantile:P"),

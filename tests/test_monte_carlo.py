@@ -56,6 +56,17 @@ def test_errors_of_any_metric(metric):
     np.testing.assert_allclose(claimed, spread, rtol=0.45)
 
 
+@pytest.mark.parametrize(("architecture", "agents"), [("broadcast", 60), ("ad-hoc", 33), ("cyclic", 40)])
+def test_many_agents(architecture, agents):
+    """Step 1 in closed form: P(k0)/(m + 1) for m arrivals."""
+    p = sf.predict(
+        sf.load_scenario(architecture=architecture, agents=agents, steps=1), [0.2], method="monte-carlo", runs=200
+    )
+    heard = 2 if architecture == "cyclic" else agents
+    expected = 100 * (1 - 0.8**heard) / (heard * 0.2)
+    assert abs(p.values()[0, 0] - expected) < 4.5 * p.standard_error()[0, 0]
+
+
 def test_certain_outcomes_have_no_error():
     p = sf.predict(sf.load_scenario(), [0.0, 1.0], method="monte-carlo", runs=10)
     np.testing.assert_allclose(p.standard_error(), 0, atol=1e-12)
@@ -78,9 +89,18 @@ def test_errors_of_one_agent_and_of_the_worst():
     [
         ({"runs": 1}, "runs: expected a whole number of at least 2, got 1"),
         ({"seed": -1}, "seed: expected a whole number of at least 0, got -1"),
+        (
+            {"runs": 10**12},
+            "runs: 1000000000000 runs for 1 link probabilities, 5 steps and 3 agents are 1.5e.13 values; expected at most",
+        ),
         ({"workers": 0}, "workers: expected a whole number of at least 1, got 0"),
     ],
 )
 def test_bad_settings(settings, message):
     with pytest.raises(sf.UsageError, match=message):
         sf.predict(sf.load_scenario(), [0.5], method="monte-carlo", **settings)
+
+
+def test_too_many_agents_are_refused():
+    with pytest.raises(sf.UsageError, match="method 'monte-carlo' takes at most 60 agents, got 100"):
+        sf.predict(sf.load_scenario(agents=100, steps=1), [0.5], method="monte-carlo")
