@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from stochfuse.comparison import Comparison as Comparison
     from stochfuse.comparison import compare as compare
     from stochfuse.crosscheck import check_results as check_results
-    from stochfuse.crosscheck import read_results as read_results
     from stochfuse.errors import NoAnswerError as NoAnswerError
     from stochfuse.errors import ScenarioError as ScenarioError
     from stochfuse.errors import StochfuseError as StochfuseError
@@ -30,6 +29,7 @@ if TYPE_CHECKING:
     from stochfuse.methods import predict as predict
     from stochfuse.prediction import Prediction as Prediction
     from stochfuse.questions import steady_state as steady_state
+    from stochfuse.results import read_results as read_results
     from stochfuse.scenario import Scenario as Scenario
     from stochfuse.scenario import load_scenario as load_scenario
     from stochfuse.states import predict_states as predict_states
@@ -53,7 +53,7 @@ _HOME = {
     "load_scenario": "scenario",
     "predict": "methods",
     "predict_states": "states",
-    "read_results": "crosscheck",
+    "read_results": "results",
     "steady_state": "questions",
 }
 

@@ -324,7 +324,7 @@ def test_pruning_reports_what_was_left_out():
     assert (left_out[:, :2] <= 1e-15).all()
     assert (left_out[:, 3] > 0).all()
     assert left_out.max() < 0.8
-    assert f"outcomes of probability up to {left_out.max():.2g} are left out" in pruned.notes[0]
+    assert f"outcomes of probability up to {left_out.max():.2g} (at µ = 0.5, step 4) are left out" in pruned.notes[0]
     # what is left out can shift the mean by no more than its probability times the largest covariance
     assert (np.abs(pruned.values() - exact.values()) <= left_out * exact.values().max() + 1e-10).all()
     complete = sf.predict(scenario, link, method="general", max_graphs=400, prune=True)

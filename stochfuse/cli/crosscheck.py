@@ -29,8 +29,8 @@ from stochfuse.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from stochfuse.crosscheck import Results
     from stochfuse.network import LinkRows
+    from stochfuse.results import Results
     from stochfuse.scenario import Scenario
 
 
@@ -76,12 +76,13 @@ def crosscheck(
     The column covariance holds the claimed covariance after fusion, as the metric says (default: trace). Per cell a
     z-score; the verdict corrects for the number of cells.
     """
-    from stochfuse.crosscheck import check_results, read_results
+    from stochfuse.crosscheck import check_results
     from stochfuse.errors import UsageError
     from stochfuse.metrics import metric as metric_of
     from stochfuse.report import crosschecks, table
     from stochfuse.report.export import terminal_width, to_json, write_text
     from stochfuse.report.predictions import View
+    from stochfuse.results import read_results
 
     check_files(output, None, file, scenario)
     settings = settings_for([method.value], max_graphs=max_graphs, prune=prune)
@@ -129,8 +130,8 @@ def crosscheck(
 
 def _rows(results: Results, scenario: Scenario) -> LinkRows:
     """Rows of the prediction for the file's link probabilities or names of cases."""
-    from stochfuse.crosscheck import ResultsError
     from stochfuse.network import stacked_rows
+    from stochfuse.results import ResultsError
     from stochfuse.scenario import link_rows
 
     links, cases = results.links, dict(scenario.network.cases)

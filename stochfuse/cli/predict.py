@@ -109,7 +109,7 @@ def predict(
             raise UsageError(f"--statistic {statistic}: expected --method general or naive, got {method.value}")
         if normalise:
             raise UsageError("--normalise: expected --statistic mean")
-        from stochfuse.general import parse_statistic
+        from stochfuse.distribution import parse_statistic
 
         kind, _ = parse_statistic(statistic)
         if kind == "derivative" and not chosen.linear:

@@ -74,7 +74,7 @@ def draw(view: View):
     if view.statistic == "mean":
         axes.set_ylabel(short + (f" [{view.unit}]" if view.unit else ", relative to µ = 0" if view.baseline else ""))
     else:
-        axes.set_ylabel("\n".join(wrap(view.what.partition(": ")[2], 60)))
+        axes.set_ylabel("\n".join(wrap(view.what.partition(": ")[2].partition(" [no unit")[0], 45)))
     if values.min() >= 0:
         axes.set_ylim(bottom=0)
     axes.grid(alpha=0.3)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from stochfuse import __version__
+from stochfuse.distribution import parse_statistic
 from stochfuse.errors import StochfuseError, UsageError
-from stochfuse.general import parse_statistic
 from stochfuse.metrics import Metric, power
 from stochfuse.prediction import Prediction
 from stochfuse.report.table import Table, number, to_csv
