@@ -131,5 +131,9 @@ def test_bad_requests(arguments, message):
 def test_forms_that_would_fill_books_are_refused():
     with pytest.raises(sf.UsageError, match="131 different covariances, too many for a closed form: give numbers"):
         derive_general(3, 3).closed()
-    with pytest.raises(sf.UsageError, match="2613 different covariances, too many for a closed form: give fewer steps"):
-        derive_general(3, 4, 25, 100, 100).closed()
+    with pytest.raises(sf.UsageError, match="too many for a closed form: give fewer steps"):
+        derive_general(3, 5, 25, 100, 100, architecture="cyclic").closed()
+    with pytest.raises(
+        sf.UsageError, match="step 3 of 5 agents has too many outcomes for an exact form: give fewer agents"
+    ):
+        derive_general(5, 3, 25, 100, 100).closed()
