@@ -107,8 +107,7 @@ class Outcomes:
         if not self.polynomial:
             raise UsageError(
                 "a polynomial in µ: expected one link probability for all links and steps, and every outcome; got "
-                "links "
-                "that differ, or outcomes left out"
+                "links that differ, or outcomes left out"
             )
         return self.expectations[step - 1][group].P
 
@@ -311,8 +310,8 @@ def check_size(network: Network) -> None:
     if number_of_senders(network.architecture, network.agents) > MOST_SENDERS or network.agents > MOST_AGENTS:
         raise UsageError(
             f"every outcome is gone through for at most {MOST_AGENTS} agents that hear at most {MOST_SENDERS} "
-            f"others each, "
-            f"got {network.agents} agents, {network.architecture}: use --method optimal or --method monte-carlo"
+            f"others each, got {network.agents} agents, {network.architecture}: use --method optimal or "
+            "--method monte-carlo"
         )
 
 

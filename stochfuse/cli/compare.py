@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated
 
 import typer
@@ -12,7 +13,6 @@ from stochfuse.cli.options import (
     ArchitectureOption,
     DigitsOption,
     EstimatorOption,
-    Format,
     FormatOption,
     LinkOption,
     MaxGraphsOption,
@@ -29,9 +29,9 @@ from stochfuse.cli.options import (
     StepsOption,
     WorkersOption,
     check_files,
-    chosen_format,
     load,
     settings_for,
+    write_report,
 )
 
 
@@ -72,8 +72,7 @@ def compare(
     from stochfuse.cli.progress import shown
     from stochfuse.comparison import compare as run
     from stochfuse.metrics import metric as metric_of
-    from stochfuse.report import comparisons, table
-    from stochfuse.report.export import terminal_width, to_json, write_text
+    from stochfuse.report import comparisons
     from stochfuse.report.predictions import View
 
     check_files(output, plot, scenario)
@@ -101,11 +100,10 @@ def compare(
             typer.echo(f"note: {prediction.method}: {note}", err=True)
     if plot is not None:
         comparisons.plot_comparison(view, plot)
-    kind = chosen_format(format, output)
-    if kind == Format.csv.value:
-        text = comparisons.compare_csv(view)
-    elif kind == Format.json.value:
-        text = to_json(comparisons.compare_json(view))
-    else:
-        text = table.render(comparisons.compare_table(view), kind, terminal_width())
-    write_text(text, output)
+    write_report(
+        format,
+        output,
+        partial(comparisons.compare_table, view),
+        partial(comparisons.compare_csv, view),
+        partial(comparisons.compare_json, view),
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -11,7 +12,6 @@ from stochfuse.cli.options import (
     AgentsOption,
     ArchitectureOption,
     DigitsOption,
-    Format,
     FormatOption,
     MaxGraphsOption,
     MetricOption,
@@ -23,9 +23,9 @@ from stochfuse.cli.options import (
     ScenarioArgument,
     StepsOption,
     check_files,
-    chosen_format,
     load,
     settings_for,
+    write_report,
 )
 
 if TYPE_CHECKING:
@@ -79,8 +79,7 @@ def crosscheck(
     from stochfuse.crosscheck import check_results
     from stochfuse.errors import UsageError
     from stochfuse.metrics import metric as metric_of
-    from stochfuse.report import crosschecks, table
-    from stochfuse.report.export import terminal_width, to_json, write_text
+    from stochfuse.report import crosschecks
     from stochfuse.report.predictions import View
     from stochfuse.results import read_results
 
@@ -111,18 +110,16 @@ def crosscheck(
         where = f" at µ = {link}" if link else ""
         typer.echo(
             f"note: column error{where}: mean squared error is {ratio:.3g} times the mean claimed covariance (not "
-            f"part of "
-            "the verdict)",
+            "part of the verdict)",
             err=True,
         )
-    kind = chosen_format(format, output)
-    if kind == Format.csv.value:
-        text = crosschecks.crosscheck_csv(shown)
-    elif kind == Format.json.value:
-        text = to_json(crosschecks.crosscheck_json(shown))
-    else:
-        text = table.render(crosschecks.crosscheck_table(shown), kind, terminal_width())
-    write_text(text, output)
+    write_report(
+        format,
+        output,
+        partial(crosschecks.crosscheck_table, shown),
+        partial(crosschecks.crosscheck_csv, shown),
+        partial(crosschecks.crosscheck_json, shown),
+    )
     if not verdict.agrees:
         typer.echo("the results disagree with the prediction", err=True)
         raise typer.Exit(1)

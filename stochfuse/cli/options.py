@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
+    from stochfuse.report.table import Table
     from stochfuse.scenario import Scenario
 
 MOST_LINKS = 1_000_000
@@ -232,6 +233,27 @@ def _range(text: str, first: float, last: float, step: float) -> list[float]:
         raise UsageError(f"--link: expected at most {MOST_LINKS} link probabilities, got {count:.3g} from '{text}'")
     values = [round(first + i * step, 12) for i in range(int(count + 1e-9) + 1)]
     return values if values[-1] >= last - 1e-12 else [*values, last]
+
+
+def write_report(
+    format: Format | None,
+    output: Path | None,
+    table: Callable[[], Table],
+    csv: Callable[[], str],
+    json: Callable[[], Any],
+) -> None:
+    """Write a report to standard output or a file, in the format asked for; only that one is made."""
+    from stochfuse.report.export import terminal_width, to_json, write_text
+    from stochfuse.report.table import render
+
+    kind = chosen_format(format, output)
+    if kind == Format.csv.value:
+        text = csv()
+    elif kind == Format.json.value:
+        text = to_json(json())
+    else:
+        text = render(table(), kind, terminal_width())
+    write_text(text, output)
 
 
 def chosen_format(format: Format | None, output: Path | None) -> str:

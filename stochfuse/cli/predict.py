@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
 from enum import StrEnum
-from pathlib import Path
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -15,7 +15,6 @@ from stochfuse.cli.options import (
     ArchitectureOption,
     DigitsOption,
     EstimatorOption,
-    Format,
     FormatOption,
     LinkOption,
     MaxGraphsOption,
@@ -32,9 +31,9 @@ from stochfuse.cli.options import (
     StepsOption,
     WorkersOption,
     check_files,
-    chosen_format,
     load,
     settings_for,
+    write_report,
 )
 
 if TYPE_CHECKING:
@@ -99,6 +98,7 @@ def predict(
     from stochfuse.errors import UsageError
     from stochfuse.methods import predict as run
     from stochfuse.metrics import metric as metric_of
+    from stochfuse.report import predictions
     from stochfuse.report.predictions import View
 
     check_files(output, plot, scenario)
@@ -136,7 +136,13 @@ def predict(
         from stochfuse.report.plot import plot_prediction
 
         plot_prediction(view, plot)
-    _write(view, chosen_format(format, output), output)
+    write_report(
+        format,
+        output,
+        partial(predictions.predict_table, view),
+        partial(predictions.predict_csv, view),
+        partial(predictions.predict_json, view),
+    )
 
 
 def _progress(method: Method) -> AbstractContextManager[Any]:
@@ -171,16 +177,3 @@ def _warn(view: View) -> None:
 def _states(view: View) -> tuple[tuple[str, ...], tuple[str, ...]]:
     model = view.prediction.scenario.model
     return model.states, model.units
-
-
-def _write(view: View, format: str, output: Path | None) -> None:
-    from stochfuse.report import predictions, table
-    from stochfuse.report.export import terminal_width, to_json, write_text
-
-    if format == Format.csv.value:
-        text = predictions.predict_csv(view)
-    elif format == Format.json.value:
-        text = to_json(predictions.predict_json(view))
-    else:
-        text = table.render(predictions.predict_table(view), format, terminal_width())
-    write_text(text, output)

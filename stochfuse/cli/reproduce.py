@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from functools import partial
 from typing import Annotated
 
 import typer
 
-from stochfuse.cli.options import Format, FormatOption, OutputOption, WorkersOption, check_files, chosen_format
+from stochfuse.cli.options import FormatOption, OutputOption, WorkersOption, check_files, write_report
 
 
 class What(StrEnum):
@@ -29,16 +30,9 @@ def reproduce(
     pair, and the exact general formulation, for three agents, five steps and the thesis' five link probabilities.
     """
     from stochfuse.report import table
-    from stochfuse.report.export import terminal_width, to_json, write_text
     from stochfuse.reproduction import timing
 
     check_files(output, None)
     measured = timing(workers=workers)
-    kind = chosen_format(format, output)
-    if kind == Format.json.value:
-        text = to_json(measured.to_mapping())
-    elif kind == Format.csv.value:
-        text = table.to_csv(("work", "thesis_s", "here_s"), measured.rows)
-    else:
-        text = table.render(measured.table(), kind, terminal_width())
-    write_text(text, output)
+    headings = ("work", "thesis_s", "here_s")
+    write_report(format, output, measured.table, partial(table.to_csv, headings, measured.rows), measured.to_mapping)

@@ -19,9 +19,8 @@ of them (fewer on a ring).
 
 Where they are too many, a scalar model is carried as a distribution of P on a grid for every r.  Time update and
 measurement update are monotone and concave in P, and so are they after one another.  Putting the mass of a grid cell
-at its mean
-can therefore only raise the expectation, and splitting it between the cell's ends, mean kept, can only lower it:
-carried side by side, the two enclose it.  (Rounding, some 1e-13, comes on top.)
+at its mean can therefore only raise the expectation, and splitting it between the cell's ends, mean kept, can only
+lower it: carried side by side, the two enclose it.  (Rounding, some 1e-13, comes on top.)
 """
 
 from __future__ import annotations
@@ -75,13 +74,11 @@ def number_of_paths(architecture: str, n: int, k: int) -> int:
     """How many paths r_1 ≥ … ≥ r_k there are: C(n+k−1, k), on a ring those that fall by at most 1 and end at 1 or 2."""
     if architecture != "cyclic":
         return comb(n + k - 1, k)
-    # of k exchanges some let one agent join; once all n have joined, it makes no difference which
-    return (
-        sum(comb(k, joins) for joins in range(min(n - 1, k + 1)))
-        + sum(comb(t - 1, n - 2) for t in range(n - 1, k + 1) if n > 1)
-        if n > 1
-        else 1
-    )
+    if n == 1:
+        return 1
+    # in some of k exchanges one agent joins; the last of n joins at some exchange t, and nothing happens after it
+    fewer = sum(comb(k, joins) for joins in range(min(n - 1, k + 1)))
+    return fewer + sum(comb(t - 1, n - 2) for t in range(n - 1, k + 1))
 
 
 def expected_optimum(
@@ -113,9 +110,8 @@ def expected_optimum(
     if model.dimension > 1:
         raise UsageError(
             f"the optimum of {agents} agents after {steps} steps has {comb(agents + steps - 1, steps):.3g} paths, "
-            f"at most "
-            f"{MOST_PATHS} are gone through for a state of several dimensions: use fewer steps or agents, or --method "
-            "monte-carlo"
+            f"at most {MOST_PATHS} are gone through for a state of several dimensions: use fewer steps or agents, or "
+            "--method monte-carlo"
         )
     rows = [_enclosed(model, sensor, P0, [t[row] for t in T], shared=shared) for row in range(len(T[0]))]
     low, high = np.array(rows).transpose(1, 0, 2)
@@ -192,7 +188,7 @@ def _cells(nodes: np.ndarray, P: np.ndarray) -> np.ndarray:
 
 def _split(nodes: np.ndarray, P: np.ndarray, mass: np.ndarray) -> np.ndarray:
     """Mass at values P put on the two nodes around each, the mean kept (beyond the last one, on that)."""
-    left = np.clip(np.searchsorted(nodes, P, side="right") - 1, 0, len(nodes) - 2)
+    left = np.minimum(_cells(nodes, P), len(nodes) - 2)
     share = np.clip((P - nodes[left]) / (nodes[left + 1] - nodes[left]), 0.0, 1.0)
     found = np.bincount(left, mass * (1.0 - share), minlength=len(nodes))
     return found + np.bincount(left + 1, mass * share, minlength=len(nodes))

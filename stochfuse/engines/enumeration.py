@@ -3,9 +3,8 @@
 The structure comes first and knows no numbers: states of the estimator are carried from exchange to exchange with the
 weight of all outcomes that lead to them, and states that will behave alike are one.  The last two exchanges are not
 carried out state by state.  After the exchange at step k − 1 agent i knows what the agents that it heard, S_i, know
-together, and so
-what agents i ∈ A have in common after it is ∩ ∪_{j∈S_i} (pedigree of j): one of the few elements of a
-distributive lattice on n generators (18 for n = 3) instead of one for each of the 2^(n(n−1)) outcomes.  Then
+together, and so what agents i ∈ A have in common after it is ∩ ∪_{j∈S_i} (pedigree of j): one of the few elements
+of a distributive lattice on n generators (18 for n = 3) instead of one for each of the 2^(n(n−1)) outcomes.  Then
 
     Y_A(k) = Σ_{i∈A} local_i(∪S_i) + Σ_{T⊆A, |T|≥2} (−1)^(|T|+1) · common(∩_{i∈T} ∪S_i)
 
@@ -256,13 +255,6 @@ def _ending(
 ) -> Ending:
     """Carry out the last exchange for every state: one view per agent."""
     weights, views = request.weights, []
-    most = max(len(concerning(last, [agent])) for group in request.groups for agent in group)
-    if most > MOST_CELLS.bit_length() // 2 + 2:
-        raise TooManyError(
-            f"an agent of {request.agents} can hear {2.0**most:.3g} different sets of others, too many to list: "
-            f"use --method "
-            "optimal or --method monte-carlo, or fewer agents"
-        )
     exchanges = layer if request.plain else [estimator.exchange(state) for state in layer]
     for group, agents in enumerate(request.groups):
         for agent in agents:

@@ -183,7 +183,7 @@ class GraphExchange:
 
     def fused(self, agent: int, heard: int) -> int:
         """Value that an agent claims after hearing some agents, with what else is due."""
-        return self.pedigrees.fuse(self.mask(heard) | self._due[agent])
+        return self.pedigrees.fuse(self.known(agent, heard))
 
     def known(self, agent: int, heard: int) -> int:
         """Pedigree of an agent after hearing some agents, with what else is due."""
