@@ -4,20 +4,40 @@ from __future__ import annotations
 
 import os
 import sys
+from importlib import import_module
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from stochfuse import __version__
-from stochfuse.cli import compare, crosscheck, derive, graph, predict, reproduce, scenario
 from stochfuse.errors import NoAnswerError, ScenarioError, StochfuseError, UsageError
+
+COMMANDS = ("predict", "compare", "solve", "messages", "derive", "graph", "crosscheck", "reproduce", "scenario")
+"""Each has a module in `stochfuse.cli`, with a function of the same name, or with an `app` of its own commands."""
 
 EXIT_FAILURE, EXIT_USAGE, EXIT_NO_ANSWER, EXIT_INTERRUPTED = 1, 2, 3, 130
 
 
 class Group(TyperGroup):
-    """Commands whose errors become one message on stderr and an exit code."""
+    """Commands that are built when they are asked for; their errors become one message on stderr and an exit code."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Names of the commands, in the order of the help."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Build one command."""
+        if cmd_name not in COMMANDS:
+            return None
+        module = import_module(f"stochfuse.cli.{cmd_name}")
+        own = getattr(module, "app", None)
+        if own is None:
+            own = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+            own.command(cmd_name)(getattr(module, cmd_name))
+        command = typer.main.get_command(own)
+        command.name = cmd_name
+        return command
 
     def invoke(self, ctx: Any) -> Any:
         """Run the chosen command."""
@@ -60,13 +80,6 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command("predict")(predict.predict)
-app.command("derive")(derive.derive)
-app.command("graph")(graph.graph)
-app.command("compare")(compare.compare)
-app.command("crosscheck")(crosscheck.crosscheck)
-app.command("reproduce")(reproduce.reproduce)
-app.add_typer(scenario.app, name="scenario")
 
 
 def _version(wanted: bool) -> None:

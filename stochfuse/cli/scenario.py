@@ -8,7 +8,13 @@ import typer
 
 from stochfuse.cli.options import Format, FormatOption, OutputOption, ScenarioArgument, chosen_format, complete_scenario
 
-app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="The scenarios: list, show, check, schema, new.")
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    help="The scenarios: list, show, check, schema, new.",
+)
 
 NEW_HEADER = """\
 # A stochfuse scenario.  `stochfuse scenario check FILE` says what does not fit; `stochfuse scenario schema` lists keys.

@@ -1,0 +1,7 @@
+"""`stochfuse solve`."""
+
+from __future__ import annotations
+
+
+def solve() -> None:
+    """To come."""
