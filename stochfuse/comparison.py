@@ -55,6 +55,7 @@ def compare(
     link: Sequence[float] | np.ndarray | float | None = None,
     methods: Sequence[str] = DEFAULT_METHODS,
     reference: str | None = None,
+    quantity: str = "claimed",
     **settings: Any,
 ) -> Comparison:
     """Predict by several methods.
@@ -64,6 +65,7 @@ def compare(
     scenario, link : as for `predict`.
     methods : at least one of `METHODS`.
     reference : the method that the others are compared with; default: general if it is among them, else the most exact.
+    quantity : what is compared, as for `predict`.
     **settings : as for `predict`.
 
     Returns
@@ -86,6 +88,7 @@ def compare(
     elif reference not in methods:
         raise UsageError(f"reference: expected one of the methods compared ({', '.join(methods)}), got '{reference}'")
     ordered = [reference, *(m for m in methods if m != reference)]
+    settings = {"quantity": quantity, **settings}
     return Comparison(tuple(_predict(scenario, link, method, settings) for method in ordered))
 
 

@@ -19,10 +19,10 @@ from stochfuse.checks import Checker, shown
 from stochfuse.errors import ScenarioError, UsageError
 from stochfuse.estimators import Late
 from stochfuse.estimators.local_fusion_graph import LocalFusionGraph, Pedigrees
-from stochfuse.general import sources_of
 from stochfuse.information import Ledger, check_definite, evaluate
 from stochfuse.kalman import Estimate, from_information
 from stochfuse.scenario import Scenario, parse, read_file
+from stochfuse.sources import sources_of
 
 SCHEMA = "stochfuse.history/1"
 MOST_NODES = 2000

@@ -31,6 +31,7 @@ from stochfuse.engines.enumeration import (
 from stochfuse.errors import StochfuseError, UsageError
 from stochfuse.estimators.local_fusion_graph import LocalFusionGraph
 from stochfuse.estimators.naive import NaiveFusion
+from stochfuse.estimators.optimal import OptimalFusion
 from stochfuse.events import (
     MOST_AGENTS_RELABELLED,
     Rows,
@@ -41,17 +42,24 @@ from stochfuse.events import (
     relabellings,
     weights_for,
 )
-from stochfuse.information import Information, Ledger, Sources, evaluate
-from stochfuse.kalman import Estimate, to_information
+from stochfuse.information import Information, Ledger, evaluate
+from stochfuse.kalman import Estimate
 from stochfuse.metrics import Metric
 from stochfuse.network import LinkRows, Network, number_of_senders
+from stochfuse.quantities import Moments, linear, matrix, value
 from stochfuse.scenario import Scenario
+from stochfuse.sources import error_sources, moments, sources_of
 
 MOST_PROBABILITIES = 20_000_000
 """Probabilities that a distribution may hold at a time."""
 MOST_AGENTS, MOST_SENDERS = 40, 12
 """Agents, and agents that one of them may hear, up to which outcomes are listed."""
-ESTIMATORS = {"local-fusion-graph": LocalFusionGraph, "naive": NaiveFusion}
+ESTIMATORS = {"local-fusion-graph": LocalFusionGraph, "naive": NaiveFusion, "optimal": OptimalFusion}
+
+
+def itself(estimate: Estimate) -> Estimate:
+    """Average estimates as they are."""
+    return estimate
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +73,7 @@ class Outcomes:
     structure : the outcomes.
     values : information of every value in the structure.
     weights : bookkeeping of probabilities.
+    of : what is averaged: the estimate itself, or the moments of its error (quantities other than claimed need them).
     """
 
     scenario: Scenario
@@ -73,6 +82,7 @@ class Outcomes:
     structure: Structure
     values: Information
     weights: Any
+    of: Callable[[Estimate], Any] = itself
 
     @property
     def polynomial(self) -> bool:
@@ -80,24 +90,25 @@ class Outcomes:
         return not isinstance(self.weights, Rows)
 
     @cached_property
-    def expectations(self) -> list[list[Estimate]]:
-        """Expected estimate per step and group of agents, on the weights' axis (coefficients A_c, or rows).
+    def expectations(self) -> list[list[Any]]:
+        """Expected estimate or moments per step and group of agents, on the weights' axis (coefficients A_c, or rows).
 
         Where outcomes were left out: given that the outcome is one of those that were not.
         """
         return [found for found, _ in self._expected]
 
     @cached_property
-    def _expected(self) -> list[tuple[list[Estimate], float]]:
-        return [expectation(ending, self.values, self.weights, len(self.groups)) for ending in self.structure.endings]
+    def _expected(self) -> list[tuple[list[Any], float]]:
+        groups = len(self.groups)
+        return [expectation(e, self.values, self.weights, groups, self.of) for e in self.structure.endings]
 
     @property
     def rounding(self) -> float:
         """Estimate of the largest relative rounding error of an outcome's covariance."""
         return 2e-16 * max(magnified for _, magnified in self._expected)
 
-    def coefficients(self, step: int, group: int = 0) -> np.ndarray:
-        """A_0 … A_L of E[P(step)](µ) = Σ A_c µ^c (1−µ)^(L−c), shape (L + 1, d, d).
+    def coefficients(self, step: int, group: int = 0, quantity: str = "claimed") -> np.ndarray:
+        """A_0 … A_L of E[P(step)](µ) = Σ A_c µ^c (1−µ)^(L−c), shape (L + 1, d, d); or of another quantity's matrix.
 
         Raises
         ------
@@ -109,11 +120,11 @@ class Outcomes:
                 "a polynomial in µ: expected one link probability for all links and steps, and every outcome; got "
                 "links that differ, or outcomes left out"
             )
-        return self.expectations[step - 1][group].P
+        return matrix(quantity, self.expectations[step - 1][group])
 
-    def covariance(self, link: np.ndarray | None = None) -> np.ndarray:
+    def covariance(self, link: np.ndarray | None = None, quantity: str = "claimed") -> np.ndarray:
         """Expected covariance, (rows, steps, groups, d, d), at the rows or, of a polynomial, at some link
-        probabilities.
+        probabilities.  Another quantity: its matrix, see `stochfuse.quantities.matrix`.
 
         Raises
         ------
@@ -122,7 +133,13 @@ class Outcomes:
         """
         if link is not None:
             self.coefficients(1)
-        return self._stacked([[self._at(e.P, link) for e in step] for step in self.expectations])
+        return self._stacked([[self._at(matrix(quantity, e), link) for e in step] for step in self.expectations])
+
+    def moments(self, link: np.ndarray | None = None) -> Moments:
+        """Expected moments of the error that were averaged, (rows, steps, groups, …), where `covariance` has them."""
+        if self.of is itself:
+            return Moments(self.covariance(link))
+        return Moments(*(self.covariance(link, q) for q in ("claimed", "actual", "bias", "rms")))
 
     def states(self) -> np.ndarray:
         """Expected state estimates, (rows, steps, groups, d, 1), (48)."""
@@ -132,14 +149,14 @@ class Outcomes:
         stacked = np.stack([np.stack(by_group, axis=1) for by_group in by_step], axis=1)
         return stacked if self.polynomial else stacked / self._kept()[:, :, None, None, None]
 
-    def derivative(self) -> np.ndarray:
-        """dE[P]/dµ at the scenario's rows, (rows, steps, groups, d, d)."""
+    def derivative(self, quantity: str = "claimed") -> np.ndarray:
+        """dE[P]/dµ at the scenario's rows, (rows, steps, groups, d, d); or of another quantity's matrix."""
         µ = self.rows.link
         out = []
         for step in range(1, len(self.expectations) + 1):
             by_group = []
             for group in range(len(self.groups)):
-                A = self.coefficients(step, group)
+                A = self.coefficients(step, group, quantity)
                 L = len(A) - 1
                 c = np.arange(L + 1).reshape(-1, 1, 1)
                 # d/dµ Σ A_c µ^c (1−µ)^(L−c), by Bernstein's form of degree L − 1
@@ -158,41 +175,45 @@ class Outcomes:
     def _kept(self) -> np.ndarray:
         return np.stack([ending.weights.sum(axis=0) for ending in self.structure.endings], axis=1)
 
-    def statistic(self, name: str, metric: Metric, groups: Sequence[int]) -> np.ndarray:
+    def statistic(self, name: str, metric: Metric, groups: Sequence[int], quantity: str = "claimed") -> np.ndarray:
         """Return a statistic of a metric over the outcomes, (rows, steps).
 
         Parameters
         ----------
         name : "variance", "std", "quantile:P", "at-most:LIMIT" or "derivative" (of the expected metric, in µ).
         groups : groups of agents, each agent as likely as every other.
+        quantity : what the metric is taken of, in each outcome.
 
         Raises
         ------
         UsageError
             If there is no such statistic, or it cannot be had of this metric.
         """
-        kind, number = parse_statistic(name)
+        kind, number = check_statistic(name, quantity, metric)
         share = [len(self.groups[g]) for g in groups]
         if kind == "derivative":
-            if not metric.linear:
-                raise UsageError(f"derivative: expected metric trace or var:STATE, got '{metric.name}'")
-            return metric.of(np.average(self.derivative()[:, :, groups], axis=2, weights=share))
+            slope = np.average(self.derivative(quantity)[:, :, groups], axis=2, weights=share)
+            return value(quantity, metric, Moments(*[slope] * 4))
         of: dict[str, Callable[[Distribution], np.ndarray]] = {
             "variance": Distribution.variance,
             "std": lambda spread: np.sqrt(spread.variance()),
             "quantile": lambda spread: spread.quantile(number),
             "at-most": lambda spread: spread.at_most(number),
         }
-        return self.over_outcomes(metric, groups, of[kind])
+        return self.over_outcomes(metric, groups, of[kind], quantity)
 
     def over_outcomes(
-        self, metric: Metric, groups: Sequence[int], of: Callable[[Distribution], np.ndarray]
+        self,
+        metric: Metric,
+        groups: Sequence[int],
+        of: Callable[[Distribution], np.ndarray],
+        quantity: str = "claimed",
     ) -> np.ndarray:
         """Return what a function (rows of it) makes of the distribution at every step, (rows, steps)."""
-        columns = [
-            np.concatenate([of(self.distribution(metric, step, groups, rows)) for rows in self._blocks_of_rows(step)])
-            for step in range(1, len(self.structure.endings) + 1)
-        ]
+        columns = []
+        for step in range(1, len(self.structure.endings) + 1):
+            blocks = self._blocks_of_rows(step)
+            columns.append(np.concatenate([of(self.distribution(metric, step, groups, b, quantity)) for b in blocks]))
         return np.stack(columns, axis=1)
 
     def _blocks_of_rows(self, step: int) -> list[slice]:
@@ -203,7 +224,12 @@ class Outcomes:
         return [slice(first, first + size) for first in range(0, rows, size)]
 
     def distribution(
-        self, metric: Metric, step: int, groups: Sequence[int] = (0,), rows: slice = slice(None)
+        self,
+        metric: Metric,
+        step: int,
+        groups: Sequence[int] = (0,),
+        rows: slice = slice(None),
+        quantity: str = "claimed",
     ) -> Distribution:
         """Values of a metric over all outcomes of a step, with their probabilities in some rows (default: every one).
 
@@ -217,16 +243,16 @@ class Outcomes:
             if not shares:
                 continue
             with np.errstate(over="ignore", invalid="ignore", under="ignore"):
-                value = metric.of(estimate.P)
-            if not np.isfinite(value).all():
+                found = value(quantity, metric, Moments(estimate.P) if quantity == "claimed" else self.of(estimate))
+            if not np.isfinite(found).all():
                 raise StochfuseError(f"{metric.label} is not finite in some outcome: it grows beyond floating point")
             before = self._probability(ending.weights[states], rows)
-            cells = np.repeat(self._probability(view.factors, rows), np.diff([*view.starts, value.shape[1]]), axis=1)
+            cells = np.repeat(self._probability(view.factors, rows), np.diff([*view.starts, found.shape[1]]), axis=1)
             last = sum(part * self._probability(share[None], rows) for share, part in shares)
-            values.append(value.ravel())
+            values.append(found.ravel())
             weights.append((before[:, :, None] * (cells * last)[:, None, :]).reshape(len(before), -1))
-        found = Distribution.merged(np.concatenate(values), np.concatenate(weights, axis=1))
-        return Distribution(found.values, found.probability / found.probability.sum(axis=1, keepdims=True))
+        merged = Distribution.merged(np.concatenate(values), np.concatenate(weights, axis=1))
+        return Distribution(merged.values, merged.probability / merged.probability.sum(axis=1, keepdims=True))
 
     def _probability(self, table: np.ndarray, rows: slice) -> np.ndarray:
         """Probabilities (rows, entries) of entries given on the weights' axis."""
@@ -240,12 +266,30 @@ class Outcomes:
         return bernstein(expected, len(expected) - 1, self.rows.link if link is None else link)
 
 
+def check_statistic(name: str, quantity: str, metric: Metric) -> tuple[str, float]:
+    """Return kind and number of a statistic.
+
+    Raises
+    ------
+    UsageError
+        If there is no such statistic, or it cannot be had of this metric.
+    """
+    kind, number = parse_statistic(name)
+    if kind == "derivative" and not linear(quantity, metric):
+        raise UsageError(
+            "derivative: expected metric trace or var:STATE of quantity claimed or actual, or the bias of one state, "
+            f"got '{metric.name}' of {quantity}"
+        )
+    return kind, number
+
+
 def outcomes(
     scenario: Scenario,
     rows: LinkRows,
     estimator: str = "local-fusion-graph",
     *,
     records: np.ndarray | None = None,
+    errors: bool = False,
     max_graphs: int = 100_000,
     prune: bool = False,
     plain: bool = False,
@@ -256,8 +300,9 @@ def outcomes(
     Parameters
     ----------
     rows : rows of link probabilities.
-    estimator : "local-fusion-graph" or "naive".
+    estimator : one of `ESTIMATORS`.
     records : measurements (steps, agents, p) where states are wanted.
+    errors : whether the moments of the actual error are wanted too; not with records.
     max_graphs : states that may be carried from step to step.
     prune : leave the least likely states out where there are more.
     plain : merge nothing.
@@ -269,17 +314,18 @@ def outcomes(
         If the outcomes are too many, or a covariance has no inverse.
     """
     network = scenario.network
-    alike = records is None
-    labels = scenario.sensor_of if alike else tuple(range(network.agents))
-    ledger = Ledger()
     check_size(network)
-    permutations = relabellings(network, rows, labels)
+    everyone = tuple(range(network.agents))
+    # records tell like agents apart; footprints only say whose noise is whose
+    permutations = relabellings(network, rows, scenario.sensor_of if records is None else everyone)
+    labels = everyone if errors or records is not None else scenario.sensor_of
+    ledger = Ledger(scenario.sensor_of if errors else None)
     made = ESTIMATORS[estimator](
         ledger, labels, shared=scenario.correlation == "shared", relabellings=None if plain else permutations
     )
     per_step = [events(network, rows, step) for step in range(1, network.steps + 1)]
     weights = Rows(len(rows.link)) if prune else weights_for(network, rows, sum(map(len, per_step)))
-    groups = groups_alike(network, rows, labels, permutations)
+    groups = groups_alike(network, rows, scenario.sensor_of if records is None else everyone, permutations)
     request = Request(
         agents=network.agents,
         steps=network.steps,
@@ -291,9 +337,10 @@ def outcomes(
         prune=prune,
         plain=plain,
     )
-    sources = sources_of(scenario, records)
+    sources = error_sources(scenario) if errors else sources_of(scenario, records)
     structure = enumerate_outcomes(made, request, progress)
-    return Outcomes(scenario, rows, groups, structure, evaluate(ledger, sources), weights)
+    of = moments if errors else itself
+    return Outcomes(scenario, rows, groups, structure, evaluate(ledger, sources), weights, of)
 
 
 def groups_alike(
@@ -313,30 +360,3 @@ def check_size(network: Network) -> None:
             f"others each, got {network.agents} agents, {network.architecture}: use --method optimal or "
             "--method monte-carlo"
         )
-
-
-def sources_of(scenario: Scenario, records: np.ndarray | None = None, *, by_agent: bool = False) -> Sources:
-    """Return what start and measurements of every source are worth.
-
-    Parameters
-    ----------
-    records : measurements (steps, agents, p); with them every agent is a source of its own.
-    by_agent : whether that is so anyway; else every kind of sensor is one.
-
-    Raises
-    ------
-    UsageError
-        If the initial covariance has no inverse.
-    """
-    x0 = None if records is None else scenario.x0
-    try:
-        start = to_information(Estimate(x0, scenario.P0))
-    except np.linalg.LinAlgError:
-        start = None
-    if start is None or not np.isfinite(start.Y).all():
-        raise UsageError("initial.P: expected an invertible covariance for the Local Fusion Graph, got a singular one")
-    sensors = scenario.sensors
-    if by_agent or records is not None:
-        sensors = [scenario.sensors[kind] for kind in scenario.sensor_of]
-    columns = None if records is None else [[z[..., None] for z in step] for step in records]
-    return Sources(scenario.model, sensors, [start] * len(sensors), columns)

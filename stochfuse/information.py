@@ -33,6 +33,8 @@ from stochfuse.kalman import (
 from stochfuse.model import Model, Sensor, at_step
 
 START, MEASURED, PRIOR = "start", "measured", "prior"
+COMMON = -1
+"""Source of an initial estimate that all agents share."""
 
 
 class Ledger:
@@ -40,9 +42,13 @@ class Ledger:
 
     A value is a sum of atoms at one step.  Sources (of start and measurement atoms) are numbers that the caller gives:
     kinds of sensors where only covariances matter, agents where their data do.
+
+    Parameters
+    ----------
+    kinds : kind of each source, where sources are agents that may change places with others of their kind; see `moved`.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, kinds: Sequence[int] | None = None) -> None:
         self.atoms: list[tuple[str, int, int]] = []
         self.step: list[int] = []
         self.sums: list[tuple[tuple[int, int], ...]] = []
@@ -50,6 +56,10 @@ class Ledger:
         self._value_of: dict[tuple[int, tuple[tuple[int, int], ...]], int] = {}
         self._prior_of: dict[int, int] = {}
         self._local_of: dict[tuple[int, int], int] = {}
+        self._kinds = kinds
+        self._by_kind = None if kinds is None else Ledger()
+        self._kind_of: dict[int, int] = {}
+        self._moved: dict[tuple[int, ...], dict[int, int]] = {}
 
     def start(self, source: int) -> int:
         """Information of an initial estimate, at step 1."""
@@ -59,10 +69,17 @@ class Ledger:
         """The next step's local estimate: predicted from a fused value, with the source's own measurement."""
         known = self._local_of.get((value, source))
         if known is None:
-            step = self.step[value] + 1
-            atoms = {self._atom(PRIOR, step, value): 1, self._atom(MEASURED, step, source): 1}
-            known = self._local_of[value, source] = self._value(step, tuple(sorted(atoms.items())))
+            known = self._local_of[value, source] = self.measured(value, (source,))
         return known
+
+    def measured(self, value: int, sources: Sequence[int]) -> int:
+        """Return the value predicted to the next step, with the measurements of some sources there."""
+        step = self.step[value] + 1
+        atoms = {self._atom(PRIOR, step, value): 1}
+        for source in sources:
+            atom = self._atom(MEASURED, step, source)
+            atoms[atom] = atoms.get(atom, 0) + 1
+        return self._value(step, tuple(sorted(atoms.items())))
 
     def forward(self, value: int, step: int) -> int:
         """Return the value brought forward to a later step by the time update (24)."""
@@ -82,6 +99,37 @@ class Ledger:
             for atom, times in sums[value if steps[value] == step else self.forward(value, step)]:
                 total[atom] = total.get(atom, 0) + coefficient * times
         return self._value(step, tuple(sorted([pair for pair in total.items() if pair[1]])))
+
+    def invariant(self, value: int) -> int:
+        """Return a number that stays the same when agents of one kind change places."""
+        if self._by_kind is None or self._kinds is None:
+            return value
+        return self._renamed(value, self._by_kind, self._kinds, self._kind_of)
+
+    def moved(self, value: int, order: tuple[int, ...]) -> int:
+        """Return the value after agents changed places: place p is taken by agent order[p]."""
+        if self._kinds is None:
+            return value
+        place = [0] * len(order)
+        for p, agent in enumerate(order):
+            place[agent] = p
+        return self._renamed(value, self, place, self._moved.setdefault(order, {}))
+
+    def _renamed(self, value: int, into: Ledger, names: Sequence[int], known: dict[int, int]) -> int:
+        new = known.get(value)
+        if new is None:
+            total: dict[int, int] = {}
+            for atom, times in self.sums[value]:
+                kind, step, of = self.atoms[atom]
+                if kind == PRIOR:
+                    of = self._renamed(of, into, names, known)
+                elif of != COMMON:
+                    of = names[of]
+                atom = into._atom(kind, step, of)
+                total[atom] = total.get(atom, 0) + times
+            atoms = tuple(sorted([pair for pair in total.items() if pair[1]]))
+            new = known[value] = into._value(self.step[value], atoms)
+        return new
 
     def _atom(self, kind: str, step: int, of: int) -> int:
         key = (kind, step, of)
@@ -108,8 +156,9 @@ class Sources:
     ----------
     model : state transition and process noise.
     sensors : sensor of each source.
-    starts : information pair of each source's initial estimate.
-    records : measurements z of shape (steps, sources, p, 1), or None where only covariances matter.
+    starts : information pair of each source's initial estimate (the last one's is that of `COMMON`); where there are
+        records, with y of shape (d, columns), one column for each world that is carried along.
+    records : measurements z of shape (steps, sources, p, columns), or None where only covariances matter.
     """
 
     def __init__(
@@ -151,7 +200,7 @@ def evaluate(ledger: Ledger, sources: Sources) -> Information:
     Returns
     -------
     Information
-        Y of shape (values, d, d) and y of shape (values, d, 1), None without records.
+        Y of shape (values, d, d) and y of shape (values, d, columns), None without records.
 
     Raises
     ------
@@ -162,7 +211,7 @@ def evaluate(ledger: Ledger, sources: Sources) -> Information:
     """
     d = sources.model.dimension
     states = sources.records is not None
-    width = d + 1 if states else d
+    width = d + (sources.starts[0].y.shape[-1] if states else 0)
     atoms, values = np.empty((len(ledger.atoms), d, width)), np.empty((len(ledger.sums), d, width))
     kinds = [kind for kind, _, _ in ledger.atoms]
     of = np.array([of for _, _, of in ledger.atoms])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,13 +12,17 @@ from stochfuse import simplified
 from stochfuse.errors import UsageError
 from stochfuse.network import LinkRows
 from stochfuse.prediction import Prediction
+from stochfuse.quantities import QUANTITIES, Moments
 from stochfuse.scenario import Scenario, link_rows
 
 METHODS = ("simplified", "general", "optimal", "naive", "monte-carlo")
-QUANTITIES = ("claimed",)
-ESTIMATORS = ("local-fusion-graph", "naive")
+ESTIMATORS = ("local-fusion-graph", "naive", "optimal")
 MOST_GRAPHS = 100_000
 RUNS, SEED = 1000, 1
+SELF_CONSISTENT = (
+    "the simplified formulation takes for granted that agents share the broadcast prior and nothing else: by its own "
+    "assumptions the actual covariance is the claimed one; for what is true see method general"
+)
 
 
 @dataclass(frozen=True)
@@ -27,7 +31,8 @@ class Settings:
 
     Parameters
     ----------
-    estimator : what the agents do with what arrives: "local-fusion-graph" or "naive" (general and monte-carlo).
+    estimator : what the agents do with what arrives (general and monte-carlo): "local-fusion-graph", "naive", or
+        "optimal", the best that linear fusion could do.
     max_graphs : general, naive: different graphs that may be carried from step to step.
     prune : general, naive: leave the least likely graphs out where there are more, instead of giving up.
     runs, seed : monte-carlo: independent runs per link probability, and the seed.
@@ -42,6 +47,9 @@ class Settings:
     seed: int = SEED
     workers: int | None = None
     progress: Any = None
+
+
+NO_ERROR = "the scenario has no known initial error (initial.error): the bias is 0, the RMS error that of the noise"
 
 
 def predict(
@@ -66,7 +74,13 @@ def predict(
         "naive", the same with naive fusion (42)/(43);
         "optimal", the best that any linear fusion could do with what arrived, by the contact chain (theory section 6);
         "monte-carlo", sampled.
-    quantity : "claimed": the covariance that the fusion rule itself reports.
+    quantity : one of
+        "claimed", the covariance that the fusion rule itself reports;
+        "actual", the covariance that its error truly has;
+        "optimal", the best that any linear fusion could do with what arrived, whatever the method;
+        "consistency", actual / claimed, more than 1 where the rule is overconfident;
+        "bias", what is left of the scenario's known initial error (initial.error);
+        "rms", the root of the mean squared error, noise and bias (theory section 7).
     steady : also solve for the steady state (simplified).
     **settings : see `Settings`.
 
@@ -88,25 +102,31 @@ def predict(
         raise TypeError(f"predict() got an unexpected keyword argument '{sorted(unknown)[0]}'")
     how = Settings(**settings)
     choose("estimator", how.estimator, ESTIMATORS)
-    if steady and method != "simplified":
-        raise UsageError(f"steady: expected method simplified, got {method}")
+    if steady and (method != "simplified" or quantity != "claimed"):
+        raise UsageError(f"steady: expected method simplified and quantity claimed, got {method} and {quantity}")
     rows = link_rows(scenario, link)
+    if quantity == "optimal":
+        method, how = ("monte-carlo" if method == "monte-carlo" else "optimal"), replace(how, estimator="optimal")
+    errors = quantity not in ("claimed", "optimal")
     make: dict[str, Callable[[], dict[str, Any]]] = {
-        "simplified": lambda: _simplified(scenario, rows),
-        "general": lambda: _enumerated(scenario, rows, how, how.estimator),
-        "naive": lambda: _enumerated(scenario, rows, how, "naive"),
-        "optimal": lambda: _optimal(scenario, rows),
-        "monte-carlo": lambda: _sampled(scenario, rows, how),
+        "simplified": lambda: _simplified(scenario, rows, errors),
+        "general": lambda: _enumerated(scenario, rows, how, how.estimator, errors),
+        "naive": lambda: _enumerated(scenario, rows, how, "naive", errors),
+        "optimal": lambda: _optimal(scenario, rows, errors),
+        "monte-carlo": lambda: _sampled(scenario, rows, how, errors),
     }
+    parts = make[method]()
+    if quantity in ("bias", "rms") and scenario.error is None:
+        parts["notes"] = (*parts["notes"], NO_ERROR)
     prediction = Prediction(
         scenario=scenario,
         method=method,
-        quantity="optimal" if method == "optimal" else quantity,
+        quantity="optimal" if method == "optimal" and quantity == "claimed" else quantity,
         stage="posterior",
         link=rows.means(scenario.network),
         cases=rows.names,
         steps=np.arange(1, scenario.network.steps + 1),
-        **make[method](),
+        **parts,
     )
     if not steady:
         return prediction
@@ -116,23 +136,58 @@ def predict(
     return prediction.with_steady(fixed.P, fixed.bound)
 
 
-def _simplified(scenario: Scenario, rows: LinkRows) -> dict[str, Any]:
+def predict_several(
+    scenario: Scenario,
+    link: Sequence[float] | np.ndarray | float | LinkRows | None,
+    method: str,
+    quantities: Sequence[str],
+    **settings: Any,
+) -> list[Prediction]:
+    """Predict several quantities, with no more work than the hardest of them needs; see `predict`."""
+    apart = [q for q in quantities if q == "optimal" and method != "optimal"]
+    together = [q for q in quantities if q not in apart]
+    # the moments of the actual error contain what is claimed
+    hardest = max(together, key=lambda q: q not in ("claimed", "optimal"), default=None)
+    found = {q: predict(scenario, link, method, q, **settings) for q in apart}
+    if hardest is not None:
+        common = predict(scenario, link, method, hardest, **settings)
+        found |= {q: common if q == hardest else common.shown_as(q) for q in together}
+    return [found[q] for q in quantities]
+
+
+def _simplified(scenario: Scenario, rows: LinkRows, errors: bool) -> dict[str, Any]:
     result = simplified.covariances(scenario, rows)
+    moments, notes = Moments(result.P), simplified.departures(scenario, rows)
+    if errors:
+        from stochfuse.states import mean_error
+
+        # one agent of each group stands for all of it
+        first = np.unique(result.group_of, return_index=True)[1]
+        moments = Moments.of(result.P, result.P, mean_error(scenario, rows)[:, :, first])
+        notes.append(SELF_CONSISTENT)
     return {
         "nature": "approximate",
-        "by_group": result.P,
+        "moments": moments,
         "group_of": result.group_of,
         "forms": result.forms,
-        "notes": tuple(simplified.departures(scenario, rows)),
+        "notes": tuple(notes),
     }
 
 
-def _enumerated(scenario: Scenario, rows: LinkRows, how: Settings, estimator: str) -> dict[str, Any]:
+def _enumerated(scenario: Scenario, rows: LinkRows, how: Settings, estimator: str, errors: bool) -> dict[str, Any]:
     from stochfuse.general import outcomes
 
     if how.max_graphs < 1:
         raise UsageError(f"max_graphs: expected a whole number of at least 1, got {how.max_graphs}")
-    found = outcomes(scenario, rows, estimator, max_graphs=how.max_graphs, prune=how.prune, progress=how.progress)
+    found = outcomes(
+        scenario,
+        rows,
+        estimator,
+        errors=errors,
+        max_graphs=how.max_graphs,
+        prune=how.prune,
+        progress=how.progress,
+    )
     left_out = float(found.left_out.max())
     notes = []
     if left_out > 1e-12:
@@ -142,14 +197,14 @@ def _enumerated(scenario: Scenario, rows: LinkRows, how: Settings, estimator: st
             f"{step + 1}) are "
             "left out; what is shown holds given one of the others"
         )
-    by_group = found.covariance()
+    moments = found.moments()
     if found.rounding > 1e-9:
         notes.append(
             f"ill-conditioned: rounding may reach a relative {found.rounding:.0e} in the covariance of some outcome"
         )
     return {
         "nature": "exact" if left_out <= 1e-12 else "approximate",
-        "by_group": by_group,
+        "moments": moments,
         "group_of": _group_of(found.groups),
         "estimator": estimator,
         "notes": tuple(notes),
@@ -162,7 +217,7 @@ def _enumerated(scenario: Scenario, rows: LinkRows, how: Settings, estimator: st
     }
 
 
-def _optimal(scenario: Scenario, rows: LinkRows) -> dict[str, Any]:
+def _optimal(scenario: Scenario, rows: LinkRows, errors: bool) -> dict[str, Any]:
     from stochfuse.engines.contact_chain import expected_optimum, number_of_paths
 
     network = scenario.network
@@ -187,7 +242,7 @@ def _optimal(scenario: Scenario, rows: LinkRows) -> dict[str, Any]:
     notes = [f"the optimum is proved to lie within a relative {bound:.0e} of the value shown"] if bound else []
     return {
         "nature": "bound" if bound else "exact",
-        "by_group": chain.P[:, :, None],
+        "moments": Moments(chain.P[:, :, None]),
         "group_of": np.zeros(network.agents, dtype=int),
         "estimator": "optimal",
         "notes": tuple(notes),
@@ -198,15 +253,23 @@ def _optimal(scenario: Scenario, rows: LinkRows) -> dict[str, Any]:
     }
 
 
-def _sampled(scenario: Scenario, rows: LinkRows, how: Settings) -> dict[str, Any]:
+def _sampled(scenario: Scenario, rows: LinkRows, how: Settings, errors: bool) -> dict[str, Any]:
     from stochfuse.sampled import sampled
 
     found = sampled(
-        scenario, rows, how.estimator, runs=how.runs, seed=how.seed, workers=how.workers, progress=how.progress
+        scenario,
+        rows,
+        how.estimator,
+        errors=errors,
+        runs=how.runs,
+        seed=how.seed,
+        workers=how.workers,
+        progress=how.progress,
     )
     return {
         "nature": "sampled",
-        "by_group": found.covariance(),
+        "notes": (),
+        "moments": found.moments(),
         "group_of": _group_of(found.groups),
         "estimator": how.estimator,
         "sampled": found,

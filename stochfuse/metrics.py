@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -29,6 +30,10 @@ class Metric:
     of : the function, from (..., d, d) to (...).
     mixed : whether it adds up quantities of different units.
     linear : whether the metric of a sum is the sum of the metrics.
+    states : indices of the states that it looks at.
+    names : their names.
+    root_unit : unit of those states themselves; empty if they have none or different ones.
+    squared : whether the metric is in squares of the states' units.
     """
 
     name: str
@@ -37,6 +42,10 @@ class Metric:
     of: Callable[[np.ndarray], np.ndarray]
     mixed: bool = False
     linear: bool = False
+    states: tuple[int, ...] = ()
+    names: str = ""
+    root_unit: str = ""
+    squared: bool = False
 
 
 def metric(name: str, model: Model) -> Metric:
@@ -51,15 +60,16 @@ def metric(name: str, model: Model) -> Metric:
     everything = ", ".join(model.states)
     if kind in ("trace", "det", "max-eig") and not rest:
         mixed = len(set(model.units)) > 1
-        unit = model.units[0]
+        unit = "" if mixed else model.units[0]
         square = power(unit, 2)
+        of = partial(Metric, states=tuple(range(model.dimension)), names=everything, root_unit=unit, squared=True)
         if kind == "trace":
             label = f"trace over {everything}" if model.dimension > 1 else f"variance of {everything}"
-            return Metric(name, label, "" if mixed else square, _trace, mixed, linear=True)
+            return of(name, label, square, _trace, mixed, linear=True)
         if kind == "max-eig":
-            return Metric(name, f"largest eigenvalue over {everything}", "" if mixed else square, _largest, mixed)
+            return of(name, f"largest eigenvalue over {everything}", square, _largest, mixed)
         units = " ".join(filter(None, (power(u, 2) for u in model.units)))
-        return Metric(name, f"determinant over {everything}", units, np.linalg.det)
+        return of(name, f"determinant over {everything}", units, np.linalg.det)
     if kind in ("var", "std", "rms") and rest:
         chosen = [_index(name, state.strip(), model) for state in rest.split(",")]
         if len(set(chosen)) < len(chosen):
@@ -69,13 +79,14 @@ def metric(name: str, model: Model) -> Metric:
         units = {model.units[i] for i in chosen}
         unit, mixed = (units.pop(), False) if len(units) == 1 else ("", True)
         names = ", ".join(model.states[i] for i in chosen)
+        of = partial(Metric, states=tuple(chosen), names=names, root_unit=unit)
         if kind == "var":
             variance = lambda P: P[..., chosen[0], chosen[0]]  # noqa: E731
-            return Metric(name, f"variance of {names}", power(unit, 2), variance, linear=True)
+            return of(name, f"variance of {names}", power(unit, 2), variance, linear=True, squared=True)
         if kind == "std":
-            return Metric(name, f"standard deviation of {names}", unit, lambda P: np.sqrt(P[..., chosen[0], chosen[0]]))
+            return of(name, f"standard deviation of {names}", unit, lambda P: np.sqrt(P[..., chosen[0], chosen[0]]))
         root = f"RMS of {names} (root of the summed variances)" if len(chosen) > 1 else f"RMS of {names}"
-        return Metric(name, root, unit, lambda P: np.sqrt(_trace(P[..., chosen, :][..., chosen])), mixed)
+        return of(name, root, unit, lambda P: np.sqrt(_trace(P[..., chosen, :][..., chosen])), mixed)
     raise UsageError(f"metric: expected {NAMES}, got '{name}'")
 
 

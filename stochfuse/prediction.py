@@ -10,6 +10,7 @@ import numpy as np
 
 from stochfuse.errors import UsageError
 from stochfuse.metrics import Metric, metric
+from stochfuse.quantities import Moments, linear, matrix, value
 from stochfuse.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -19,19 +20,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Expected covariance against link probability and step.
+    """Expected covariance, or another quantity of the error, against link probability and step.
 
     Parameters
     ----------
     scenario : what was given.
-    method : how it was computed: "simplified", "general", "naive" or "monte-carlo".
-    quantity : which covariance: "claimed".
+    method : how it was computed: "simplified", "general", "naive", "optimal" or "monte-carlo".
+    quantity : what is shown, one of `stochfuse.quantities.QUANTITIES`.
     stage : "posterior": after the step's measurement and fusion.
     nature : "exact", "approximate", "bound" or "sampled".
     link : (links,) link probability of each row, averaged over the links if they differ.
     cases : a name per row where the rows are cases, else None.
     steps : (steps,) step numbers, from 1.
-    by_group : (links, steps, groups, d, d) covariance per group of agents that are alike.
+    moments : moments of the error, (links, steps, groups, …), per group of agents that are alike.
     group_of : (agents,) index into the groups.
     forms : numeric forms used.
     notes : what the reader should know, one sentence each.
@@ -51,7 +52,7 @@ class Prediction:
     link: np.ndarray
     cases: tuple[str, ...] | None
     steps: np.ndarray
-    by_group: np.ndarray
+    moments: Moments
     group_of: np.ndarray
     forms: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
@@ -63,8 +64,16 @@ class Prediction:
     steady_bound: np.ndarray | None = field(default=None, repr=False)
 
     @property
+    def by_group(self) -> np.ndarray:
+        """Covariance per group of agents, shape (links, steps, groups, d, d).
+
+        Of consistency it is the actual covariance, of rms the mean squared error, of bias the vector (…, d, 1).
+        """
+        return matrix(self.quantity, self.moments)
+
+    @property
     def covariance(self) -> np.ndarray:
-        """Covariance averaged over the agents, shape (links, steps, d, d)."""
+        """The same averaged over the agents, shape (links, steps, d, d)."""
         return self.of_agent("mean")
 
     @property
@@ -73,11 +82,23 @@ class Prediction:
         return self.by_group.shape[2] == 1
 
     def of_agent(self, agent: int | str = "mean") -> np.ndarray:
-        """Covariance of one agent (numbered from 1) or averaged over all, shape (links, steps, d, d)."""
+        """The same of one agent (numbered from 1) or averaged over all, shape (links, steps, d, d)."""
         return self._select(self.by_group, agent)
 
+    def shown_as(self, quantity: str) -> Prediction:
+        """Return the same prediction with another quantity of those that were computed.
+
+        Raises
+        ------
+        UsageError
+            If it was not computed.
+        """
+        if matrix(quantity, self.moments) is None:
+            raise UsageError(f"quantity {quantity}: was not computed; predict it with quantity='{quantity}'")
+        return replace(self, quantity=quantity)
+
     def values(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray:
-        """Return a metric of the covariance, shape (links, steps).
+        """Return a metric of the covariance (or what the quantity makes of it), shape (links, steps).
 
         Parameters
         ----------
@@ -85,7 +106,7 @@ class Prediction:
         agent : "mean" (of the covariance averaged over the agents), a number from 1, or "worst" or "best" (the largest
             or smallest value among the agents, for each link and step).
         """
-        return self._reduce(self.by_group, of, agent)
+        return self._reduce(self.moments, of, agent)
 
     def statistic(self, name: str, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray:
         """Return a statistic of a metric over the outcomes, shape (links, steps).
@@ -109,20 +130,24 @@ class Prediction:
         m = metric(of, self.scenario.model) if isinstance(of, str) else of
         everyone = list(range(self.by_group.shape[2]))
         if agent in ("worst", "best"):
-            each = np.stack([self.outcomes.statistic(name, m, [g]) for g in everyone])
+            each = np.stack([self.outcomes.statistic(name, m, [g], self.quantity) for g in everyone])
             return each.max(axis=0) if agent == "worst" else each.min(axis=0)
-        return self.outcomes.statistic(name, m, everyone if agent == "mean" else [self._group(agent)])
+        chosen = everyone if agent == "mean" else [self._group(agent)]
+        return self.outcomes.statistic(name, m, chosen, self.quantity)
 
     def polynomials(self, of: Metric, agent: int | str = "mean") -> list[np.ndarray] | None:
         """Return A_0 … A_L per step of a linear metric's polynomial Σ A_c µ^c (1−µ)^(L−c); None if there is none."""
         if self.outcomes is None or not self.outcomes.polynomial or agent in ("worst", "best"):
             return None
+        if not linear(self.quantity, of):
+            return None
         groups = range(self.by_group.shape[2]) if agent == "mean" else [self._group(agent)]
         share = [(self.group_of == g).sum() for g in groups]
-        return [
-            of.of(np.average([self.outcomes.coefficients(int(k), g) for g in groups], axis=0, weights=share))
-            for k in self.steps
-        ]
+        by_step = []
+        for k in self.steps:
+            each = [self.outcomes.coefficients(int(k), g, self.quantity) for g in groups]
+            by_step.append(value(self.quantity, of, Moments(*[np.average(each, axis=0, weights=share)] * 4)))
+        return by_step
 
     def standard_error(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray | None:
         """Return the standard error of `values`, shape (links, steps), or None if nothing was sampled."""
@@ -131,11 +156,12 @@ class Prediction:
         m = metric(of, self.scenario.model) if isinstance(of, str) else of
         groups = self.sampled.groups
         if agent in ("worst", "best"):
-            each = np.stack([self.sampled.standard_error(m, group) for group in groups])
-            P = m.of(self.by_group)
-            chosen = P.argmax(axis=-1) if agent == "worst" else P.argmin(axis=-1)
+            each = np.stack([self.sampled.standard_error(m, group, self.quantity) for group in groups])
+            values = value(self.quantity, m, self.moments)
+            chosen = values.argmax(axis=-1) if agent == "worst" else values.argmin(axis=-1)
             return np.take_along_axis(each, chosen[None], axis=0)[0]
-        return self.sampled.standard_error(m, sum(groups, ()) if agent == "mean" else groups[self._group(agent)])
+        whom = sum(groups, ()) if agent == "mean" else groups[self._group(agent)]
+        return self.sampled.standard_error(m, whom, self.quantity)
 
     def _group(self, agent: int | str) -> int:
         if isinstance(agent, int | np.integer) and 1 <= agent <= len(self.group_of):
@@ -144,7 +170,7 @@ class Prediction:
 
     def steady_values(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray | None:
         """Return a metric of the steady state, shape (links,), or None if none was computed."""
-        return None if self.steady is None else self._reduce(self.steady, of, agent)
+        return None if self.steady is None else self._reduce(Moments(self.steady), of, agent)
 
     def table(self, of: str = "trace", agent: int | str = "mean") -> str:
         """Return the table as text, as `stochfuse predict` prints it."""
@@ -157,16 +183,16 @@ class Prediction:
         """Return the same with its steady state."""
         return replace(self, steady=P, steady_bound=bound)
 
-    def _reduce(self, P: np.ndarray, of: str | Metric, agent: int | str) -> np.ndarray:
+    def _reduce(self, moments: Moments, of: str | Metric, agent: int | str) -> np.ndarray:
         m = metric(of, self.scenario.model) if isinstance(of, str) else of
         with np.errstate(over="ignore", invalid="ignore"):
             if agent in ("worst", "best"):
-                each = m.of(P)
+                each = value(self.quantity, m, moments)
                 return each.max(axis=-1) if agent == "worst" else each.min(axis=-1)
-            return m.of(self._select(P, agent))
+            return value(self.quantity, m, moments.map(lambda M: self._select(M, agent)))
 
-    def _select(self, P: np.ndarray, agent: int | str) -> np.ndarray:
+    def _select(self, M: np.ndarray, agent: int | str) -> np.ndarray:
         if agent != "mean":
-            return P[..., self._group(agent), :, :]
-        share = np.bincount(self.group_of, minlength=P.shape[-3]) / len(self.group_of)
-        return P[..., 0, :, :] if P.shape[-3] == 1 else np.tensordot(P, share, axes=(P.ndim - 3, 0))
+            return M[..., self._group(agent), :, :]
+        share = np.bincount(self.group_of, minlength=M.shape[-3]) / len(self.group_of)
+        return M[..., 0, :, :] if M.shape[-3] == 1 else np.tensordot(M, share, axes=(M.ndim - 3, 0))

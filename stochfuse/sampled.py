@@ -18,10 +18,12 @@ from stochfuse.engines import Progress
 from stochfuse.engines.monte_carlo import Experiment, Sample, sample
 from stochfuse.errors import UsageError
 from stochfuse.events import events, relabellings
-from stochfuse.general import ESTIMATORS, groups_alike, sources_of
+from stochfuse.general import ESTIMATORS, groups_alike
 from stochfuse.metrics import Metric
 from stochfuse.network import LinkRows
+from stochfuse.quantities import Moments, value
 from stochfuse.scenario import Scenario
+from stochfuse.sources import claimed_only, error_sources, moments, sources_of
 
 MOST_AGENTS, MOST_NUMBERS = 60, 500_000_000
 """Agents whose sets fit a machine word, and claimed values that a sample may hold."""
@@ -33,11 +35,11 @@ STEP = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Sampled:
-    """A sample of claimed covariances.
+    """A sample of claimed covariances, and of the moments of the actual error where they are asked for.
 
     Parameters
     ----------
-    sample : different covariances, and which of them each agent claims in each run.
+    sample : different moments, and which of them each agent has in each run.
     groups : agents that are alike.
     """
 
@@ -49,9 +51,12 @@ class Sampled:
         """Runs per row."""
         return self.sample.which.shape[1]
 
-    def covariance(self) -> np.ndarray:
-        """Mean covariance per group, (rows, steps, groups, d, d)."""
-        values, index = self.sample
+    def moments(self) -> Moments:
+        """Mean moments per group, (rows, steps, groups, …)."""
+        return self.sample.values.map(self._mean)
+
+    def _mean(self, values: np.ndarray) -> np.ndarray:
+        index = self.sample.which
         out = np.empty((index.shape[0], index.shape[2], len(self.groups), *values.shape[1:]))
         for g, agents in enumerate(self.groups):
             for row in range(len(index)):
@@ -61,16 +66,19 @@ class Sampled:
                     out[row, step, g] = np.tensordot(counts[used], values[used], axes=1) / counts.sum()
         return out
 
-    def standard_error(self, metric: Metric, agents: tuple[int, ...]) -> np.ndarray:
-        """Standard error of the metric of the mean over some agents, (rows, steps)."""
+    def standard_error(self, metric: Metric, agents: tuple[int, ...], quantity: str = "claimed") -> np.ndarray:
+        """Standard error of a quantity of the mean over some agents, (rows, steps)."""
         values, index = self.sample
         out = np.empty((index.shape[0], index.shape[2]))
         for row in range(len(index)):
             for step in range(index.shape[2]):
-                P = values[index[row, :, step][:, list(agents)]].mean(axis=1)
-                mean = P.mean(axis=0)
-                deviation = STEP * (P - mean)
-                slope = (metric.of(mean + deviation) - metric.of(mean - deviation)) / (2 * STEP)
+                which = index[row, :, step][:, list(agents)]
+                runs = values.map(lambda m: m[which].mean(axis=1))  # noqa: B023
+                above, below = (
+                    value(quantity, metric, runs.map(lambda m: m.mean(axis=0) + h * (m - m.mean(axis=0))))  # noqa: B023
+                    for h in (STEP, -STEP)
+                )
+                slope = (above - below) / (2 * STEP)
                 out[row, step] = np.sqrt((slope**2).sum() / (self.runs - 1) / self.runs)
         return out
 
@@ -80,6 +88,7 @@ def sampled(
     rows: LinkRows,
     estimator: str = "local-fusion-graph",
     *,
+    errors: bool = False,
     runs: int = 1000,
     seed: int = 1,
     workers: int | None = None,
@@ -89,6 +98,7 @@ def sampled(
 
     Parameters
     ----------
+    errors : whether the moments of the actual error are wanted too.
     runs : independent runs for every row, at least 2.
     seed : of the random numbers; the same seed gives the same sample, whatever the number of workers.
     workers : processes; default: one for small samples, else one per processor.
@@ -99,10 +109,10 @@ def sampled(
     UsageError
         If runs, seed or workers are out of range.
     """
-    for name, value, least in (("runs", runs, 2), ("seed", seed, 0), ("workers", 1 if workers is None else workers, 1)):
-        if value < least:
-            raise UsageError(f"{name}: expected a whole number of at least {least}, got {value}")
-    network, labels = scenario.network, scenario.sensor_of
+    for name, given, least in (("runs", runs, 2), ("seed", seed, 0), ("workers", 1 if workers is None else workers, 1)):
+        if given < least:
+            raise UsageError(f"{name}: expected a whole number of at least {least}, got {given}")
+    network, kinds = scenario.network, scenario.sensor_of
     if network.agents > MOST_AGENTS:
         raise UsageError(f"method 'monte-carlo' takes at most {MOST_AGENTS} agents, got {network.agents}")
     numbers = runs * len(rows.link) * network.steps * network.agents
@@ -112,14 +122,17 @@ def sampled(
             f"{network.agents} agents are "
             f"{numbers:.3g} values; expected at most {MOST_NUMBERS:.3g}"
         )
-    permutations = relabellings(network, rows, labels)
+    permutations = relabellings(network, rows, kinds)
+    labels = tuple(range(network.agents)) if errors else kinds
     shared = scenario.correlation == "shared"
     experiment = Experiment(
         agents=network.agents,
         events=[events(network, rows, step) for step in range(1, network.steps + 1)],
         delay=network.delay,
         estimator=partial(ESTIMATORS[estimator], sources=labels, shared=shared, relabellings=permutations),
-        sources=sources_of(scenario),
+        sources=error_sources(scenario) if errors else sources_of(scenario),
+        of=moments if errors else claimed_only,
+        kinds=kinds if errors else None,
         runs=runs,
         seed=seed,
     )
@@ -127,4 +140,4 @@ def sampled(
         workers = len(os.sched_getaffinity(0)) if runs * len(rows.link) >= MANY else 1
     told = None if progress is None else lambda done, total: progress.advance(0, done, total)
     drawn = sample(experiment, len(rows.link), workers=workers, progress=told)
-    return Sampled(drawn, groups_alike(network, rows, labels, permutations))
+    return Sampled(drawn, groups_alike(network, rows, kinds, permutations))

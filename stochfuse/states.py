@@ -13,6 +13,7 @@ of the common one.  The printed (53) puts the averaged P(k) in front of the sum;
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import chain, combinations
 from typing import Any, NamedTuple
 
@@ -92,6 +93,27 @@ def predict_states(
     return States(rows.means(scenario.network), np.arange(1, steps + 1), x[..., 0], scenario.model.states)
 
 
+def mean_error(scenario: Scenario, rows: LinkRows) -> np.ndarray:
+    """What (53) leaves of the scenario's known initial error, shape (links, steps, agents, d, 1).
+
+    An error obeys the equations of an estimate in a world whose state is zero: b(k) = (I − K̄H) F b(k−1) for like
+    agents.
+
+    Raises
+    ------
+    UsageError
+        If unlike agents are too many to average over all sets of senders.
+    """
+    steps, n, d = scenario.network.steps, scenario.network.agents, scenario.model.dimension
+    if scenario.error is None:
+        return np.zeros((len(rows.link), steps, n, d, 1))
+    still = replace(scenario, x0=scenario.error, model=replace(scenario.model, Bu=np.zeros((d, 1))))
+    widths = [sensor.H.shape[-2] for sensor in scenario.sensors]
+    if len(widths) == 1:
+        return _one_record(still, rows, np.zeros((steps, widths[0])), printed=False)
+    return _own_records(still, rows, [[np.zeros(widths[kind]) for kind in scenario.sensor_of]] * steps)
+
+
 def _one_record(scenario: Scenario, rows: LinkRows, z: np.ndarray, printed: bool) -> np.ndarray:
     (group,) = simplified.groups(scenario, rows)
     case = group.case
@@ -137,7 +159,7 @@ def _printed(prior: Estimate, sensor: Sensor, arrivals: Arrivals, z: np.ndarray,
     return P @ (before.y + measured * (local.y - before.y))
 
 
-def _own_records(scenario: Scenario, rows: LinkRows, z: np.ndarray) -> np.ndarray:
+def _own_records(scenario: Scenario, rows: LinkRows, z: Sequence[Sequence[np.ndarray]] | np.ndarray) -> np.ndarray:
     network, d = scenario.network, scenario.model.dimension
     if network.agents > MOST_AGENTS:
         raise UsageError(
@@ -173,7 +195,7 @@ def _over_subsets(
     senders: np.ndarray,
     heard: np.ndarray,
     sensors: list[tuple[np.ndarray, np.ndarray]],
-    z: np.ndarray,
+    z: Sequence[np.ndarray] | np.ndarray,
 ) -> np.ndarray:
     total, start = np.zeros_like(prior.x), factor(prior.P)
     places = range(len(senders))

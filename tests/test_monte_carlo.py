@@ -21,7 +21,7 @@ def test_the_sample_depends_on_the_seed_alone(architecture, monkeypatch):
         monkeypatch.setattr(monte_carlo, "MERGE_BELOW", merge_below)
         other = sf.predict(scenario, [0.3, 0.6], workers=1, **kwargs)
         sample, first = other.sampled.sample, one.sampled.sample
-        np.testing.assert_allclose(sample.values[sample.which], first.values[first.which], rtol=1e-12)
+        np.testing.assert_allclose(sample.values.P[sample.which], first.values.P[first.which], rtol=1e-12)
     different = sf.predict(scenario, [0.3, 0.6], method="monte-carlo", runs=2500, seed=12)
     assert (different.values() != one.values()).any()
 

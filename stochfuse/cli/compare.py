@@ -22,6 +22,7 @@ from stochfuse.cli.options import (
     PlotOption,
     PruneOption,
     QOption,
+    QuantityOption,
     ROption,
     RunsOption,
     ScenarioArgument,
@@ -30,6 +31,7 @@ from stochfuse.cli.options import (
     WorkersOption,
     check_files,
     load,
+    quantity_names,
     settings_for,
     write_report,
 )
@@ -51,6 +53,7 @@ def compare(
     p0: P0Option = None,
     architecture: ArchitectureOption = None,
     estimator: EstimatorOption = None,
+    quantity: QuantityOption = "claimed",
     metric: MetricOption = None,
     agent: AgentOption = "mean",
     relative: Annotated[bool, typer.Option("--relative", help="Differences in per cent of the reference.")] = False,
@@ -71,6 +74,7 @@ def compare(
     """
     from stochfuse.cli.progress import shown
     from stochfuse.comparison import compare as run
+    from stochfuse.errors import UsageError
     from stochfuse.metrics import metric as metric_of
     from stochfuse.report import comparisons
     from stochfuse.report.predictions import View
@@ -86,10 +90,13 @@ def compare(
         seed=seed,
         workers=workers,
     )
+    quantities = quantity_names(quantity)
+    if len(quantities) > 1:
+        raise UsageError(f"--quantity: expected one to compare methods by, got {quantity}; for several see predict")
     given, links = load(scenario, agents, steps, architecture, q, r, p0, link)
     chosen = metric_of(metric or given.metric or "trace", given.model)
     with shown() as progress:
-        found = run(given, links, chosen_methods, reference, progress=progress, **settings)
+        found = run(given, links, chosen_methods, reference, quantities[0], progress=progress, **settings)
     whose = int(agent) if agent.isdigit() else agent
     view = comparisons.ComparisonView(
         found, tuple(View(p, chosen, whose, None, digits) for p in found.predictions), relative

@@ -31,6 +31,7 @@ class Estimator(StrEnum):
 
     local_fusion_graph = "local-fusion-graph"
     naive = "naive"
+    optimal = "optimal"
 
 
 class Architecture(StrEnum):
@@ -120,6 +121,14 @@ WorkersOption = Annotated[
     int | None,
     typer.Option(min=1, help="monte-carlo: processes; default: one for small samples, else one per processor."),
 ]
+QuantityOption = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME",
+        help="claimed, actual, optimal, consistency (actual / claimed), bias or rms; several side by side: "
+        "claimed,actual.",
+    ),
+]
 DigitsOption = Annotated[int, typer.Option(min=1, max=17, help="Significant digits in tables.")]
 PlotOption = Annotated[Path | None, typer.Option(metavar="FILE", help="Also draw a figure: .png, .svg or .pdf.")]
 
@@ -178,6 +187,26 @@ def settings_for(methods: Sequence[str], **settings: Any) -> dict[str, Any]:
             option = "--" + name.replace("_", "-")
             raise UsageError(f"{option}: expected method {' or '.join(APPLIES_TO[name])}, got {', '.join(methods)}")
     return {name: value.value if isinstance(value, StrEnum) else value for name, value in given.items()}
+
+
+def quantity_names(text: str) -> list[str]:
+    """Return the quantities of `claimed` or `claimed,actual`.
+
+    Raises
+    ------
+    UsageError
+        If one is unknown or named twice.
+    """
+    from stochfuse.errors import UsageError
+    from stochfuse.quantities import QUANTITIES
+
+    names = [name.strip() for name in text.split(",")]
+    for name in names:
+        if name not in QUANTITIES:
+            raise UsageError(f"--quantity: expected one or several of {', '.join(QUANTITIES)}, got '{name}'")
+    if len(set(names)) < len(names):
+        raise UsageError(f"--quantity: expected different ones, got {text}")
+    return names
 
 
 def check_files(output: Path | None, plot: Path | None, *inputs: str) -> None:

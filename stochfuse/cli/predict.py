@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import AbstractContextManager, nullcontext
 from enum import StrEnum
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -15,6 +16,7 @@ from stochfuse.cli.options import (
     ArchitectureOption,
     DigitsOption,
     EstimatorOption,
+    Format,
     FormatOption,
     LinkOption,
     MaxGraphsOption,
@@ -24,6 +26,7 @@ from stochfuse.cli.options import (
     PlotOption,
     PruneOption,
     QOption,
+    QuantityOption,
     ROption,
     RunsOption,
     ScenarioArgument,
@@ -32,6 +35,7 @@ from stochfuse.cli.options import (
     WorkersOption,
     check_files,
     load,
+    quantity_names,
     settings_for,
     write_report,
 )
@@ -50,12 +54,6 @@ class Method(StrEnum):
     monte_carlo = "monte-carlo"
 
 
-class Quantity(StrEnum):
-    """Quantities predicted."""
-
-    claimed = "claimed"
-
-
 def predict(
     scenario: ScenarioArgument = "thesis-transient",
     agents: AgentsOption = None,
@@ -67,7 +65,7 @@ def predict(
     architecture: ArchitectureOption = None,
     method: Annotated[Method, typer.Option(help="How to average over which messages arrive.")] = Method.simplified,
     estimator: EstimatorOption = None,
-    quantity: Annotated[Quantity, typer.Option(help="Which covariance.")] = Quantity.claimed,
+    quantity: QuantityOption = "claimed",
     metric: MetricOption = None,
     statistic: Annotated[
         str,
@@ -96,12 +94,12 @@ def predict(
     Without a scenario: the thesis' transient one. Options override the scenario.
     """
     from stochfuse.errors import UsageError
-    from stochfuse.methods import predict as run
+    from stochfuse.methods import predict_several as run
     from stochfuse.metrics import metric as metric_of
-    from stochfuse.report import predictions
     from stochfuse.report.predictions import View
 
     check_files(output, plot, scenario)
+    quantities = quantity_names(quantity)
     given, links = load(scenario, agents, steps, architecture, q, r, p0, link)
     chosen = metric_of(metric or given.metric or "trace", given.model)
     if statistic != "mean":
@@ -109,11 +107,10 @@ def predict(
             raise UsageError(f"--statistic {statistic}: expected --method general or naive, got {method.value}")
         if normalise:
             raise UsageError("--normalise: expected --statistic mean")
-        from stochfuse.distribution import parse_statistic
+        from stochfuse.general import check_statistic
 
-        kind, _ = parse_statistic(statistic)
-        if kind == "derivative" and not chosen.linear:
-            raise UsageError(f"derivative: expected metric trace or var:STATE, got '{chosen.name}'")
+        for name in quantities:
+            check_statistic(statistic, name, chosen)
     settings = {
         "steady": steady,
         **settings_for(
@@ -126,12 +123,25 @@ def predict(
             workers=workers,
         ),
     }
+    whose = int(agent) if agent.isdigit() else agent
     with _progress(method) as settings["progress"]:
-        prediction = run(given, links, method.value, quantity.value, **settings)
-        baseline = run(given, [0.0], method.value, quantity.value, **settings) if normalise else None
-    view = View(prediction, chosen, int(agent) if agent.isdigit() else agent, baseline, digits, statistic)
-    view.values()  # a request that cannot be met should say so before notes and figures
-    _warn(view)
+        found = run(given, links, method.value, quantities, **settings)
+        at_zero = run(given, [0.0], method.value, quantities, **settings) if normalise else [None] * len(found)
+    views = tuple(
+        View(p, chosen, whose, baseline, digits, statistic) for p, baseline in zip(found, at_zero, strict=True)
+    )
+    for view in views:
+        view.values()  # a request that cannot be met should say so before notes and figures
+    _warn(views)
+    if len(views) == 1:
+        _report(views[0], format, output, plot)
+    else:
+        _report_several(views, format, output, plot)
+
+
+def _report(view: View, format: Format | None, output: Path | None, plot: Path | None) -> None:
+    from stochfuse.report import predictions
+
     if plot is not None:
         from stochfuse.report.plot import plot_prediction
 
@@ -145,6 +155,20 @@ def predict(
     )
 
 
+def _report_several(views: tuple[View, ...], format: Format | None, output: Path | None, plot: Path | None) -> None:
+    from stochfuse.report import side_by_side
+
+    if plot is not None:
+        side_by_side.plot_side(views, plot)
+    write_report(
+        format,
+        output,
+        partial(side_by_side.side_table, views),
+        partial(side_by_side.side_csv, views),
+        partial(side_by_side.side_json, views),
+    )
+
+
 def _progress(method: Method) -> AbstractContextManager[Any]:
     if method is Method.simplified:
         return nullcontext()
@@ -153,27 +177,30 @@ def _progress(method: Method) -> AbstractContextManager[Any]:
     return shown()
 
 
-def _warn(view: View) -> None:
-    if view.prediction.sampled is not None and view.agent in ("worst", "best") and not view.prediction.alike:
-        typer.echo(f"note: which agent is the {view.agent} is judged by the same sample: the value is biased", err=True)
-    for note in view.prediction.notes:
+def _warn(views: tuple[View, ...]) -> None:
+    first = views[0]
+    if first.prediction.sampled is not None and first.agent in ("worst", "best") and not first.prediction.alike:
+        typer.echo(
+            f"note: which agent is the {first.agent} is judged by the same sample: the value is biased", err=True
+        )
+    for note in dict.fromkeys(note for view in views for note in view.prediction.notes):
         typer.echo(f"note: {note}", err=True)
-    if view.metric.mixed and not view.baseline:
-        names = ", ".join(f"{n} [{u}]" for n, u in zip(*_states(view), strict=True))
-        typer.echo(f"note: {view.metric.name} adds up different units ({names}); see --metric", err=True)
-    bound = view.prediction.steady_bound
-    if bound is not None:
-        worst = bound.max()
-        if worst < 1:
-            typer.echo(
-                f"note: the steady state is proved to lie within a relative {worst:.0e} of the value shown", err=True
-            )
-        else:
-            typer.echo(
-                "note: the steady state's residual is at rounding level, but no bound on it could be proved", err=True
-            )
+    if first.metric.mixed and not first.baseline:
+        model = first.prediction.scenario.model
+        names = ", ".join(f"{n} [{u}]" for n, u in zip(model.states, model.units, strict=True))
+        typer.echo(f"note: {first.metric.name} adds up different units ({names}); see --metric", err=True)
+    for view in views:
+        text = view.overconfidence()
+        if text:
+            typer.echo(f"warning: {text}", err=True)
+            break
+    if first.prediction.steady_bound is not None:
+        _tell_bound(first.prediction.steady_bound.max())
 
 
-def _states(view: View) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    model = view.prediction.scenario.model
-    return model.states, model.units
+def _tell_bound(worst: float) -> None:
+    if worst < 1:
+        text = f"the steady state is proved to lie within a relative {worst:.0e} of the value shown"
+    else:
+        text = "the steady state's residual is at rounding level, but no bound on it could be proved"
+    typer.echo(f"note: {text}", err=True)

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -141,7 +141,7 @@ def _enumerate(estimator: Estimator, request: Request, progress: Progress) -> St
     number = [1]
     for step, d in enumerate(drawn, start=1):
         number.append(number[-1] * len(fates(request.delay, steps - step)) ** len(d))
-    two_steps = request.delay == (1.0,) and n <= MOST_GENERATORS and not request.plain
+    two_steps = estimator.additive and request.delay == (1.0,) and n <= MOST_GENERATORS and not request.plain
     start = estimator.start()
     layer: dict[Any, Any] = {estimator.exchange(start) if request.plain else start: weights.one()}
     sizes, announced = [1], False
@@ -401,14 +401,16 @@ def claimed(ending: Ending, values: Information) -> Iterator[tuple[View, slice, 
     Yields
     ------
     view, states, estimate, Y
-        Estimate of P (states, cells, d, d) and, if the values have states, x (states, cells, d, 1); P's information.
+        Estimate of P (states, cells, d, d) and, if the values have states, x (states, cells, d, columns); P's
+        information.
     """
     d = values.Y.shape[-1]
+    width = d if values.y is None else max(d, values.y.shape[-1])
     Y = np.concatenate([values.Y, np.zeros((1, d, d))])
-    y = None if values.y is None else np.concatenate([values.y, np.zeros((1, d, 1))])
+    y = None if values.y is None else np.concatenate([values.y, np.zeros_like(values.y[:1])])
     for view in ending.views:
         cells = len(view.terms[0][1])
-        size = max(1, CHUNK // (cells * d * d))
+        size = max(1, CHUNK // (cells * d * width))
         for first in range(0, len(view.ids), size):
             states = slice(first, first + size)
             ids = view.ids[states]
@@ -425,22 +427,30 @@ def _summed(values: np.ndarray, ids: np.ndarray, terms: tuple[tuple[int, np.ndar
     return total
 
 
-def expectation(ending: Ending, values: Information, weights: Weights, groups: int) -> tuple[list[Estimate], float]:
+def expectation(
+    ending: Ending, values: Information, weights: Weights, groups: int, of: Callable[[Estimate], Any]
+) -> tuple[list[Any], float]:
     """Expected state and covariance per group of agents, (48)/(49), on the weights' axis.
+
+    Parameters
+    ----------
+    of : makes what is averaged, a named tuple of arrays or Nones, of a stack of estimates.
 
     Returns
     -------
-    list of Estimate
-        P of shape (width, d, d): coefficients A_c of the polynomial in µ, or one matrix per row; x (width, d, 1) or
-        None.
+    list
+        What `of` makes, averaged, per group: arrays of shape (width, …), the coefficients A_c of the polynomial in µ,
+        or one per row.
     float
         Largest P_ii Y_ii of any outcome: by how much rounding is magnified when its information is inverted.
     """
-    magnified = 1.0
-    sums: list[list[Any]] = [[None, None] for _ in range(groups)]
+    magnified, kind = 1.0, cast(Any, Estimate)
+    sums: list[dict[int, Any]] = [{} for _ in range(groups)]
     for view, states, estimate, Y in claimed(ending, values):
         magnified = max(magnified, float((_diagonal(estimate.P) * _diagonal(Y)).max()))
-        for place, value in enumerate(estimate):
+        averaged = of(estimate)
+        kind = type(averaged)
+        for place, value in enumerate(averaged):
             if value is None:
                 continue
             by_factor = np.add.reduceat(value, view.starts, axis=1)
@@ -448,9 +458,8 @@ def expectation(ending: Ending, values: Information, weights: Weights, groups: i
             for group, share in enumerate(view.shares):
                 if share is not None:
                     part = weights.completed(weights.weighed(total, share), ending.events)
-                    known = sums[group][place]
-                    sums[group][place] = part if known is None else known + part
-    return [Estimate(*pair) for pair in sums], magnified
+                    sums[group][place] = sums[group][place] + part if place in sums[group] else part
+    return [kind(*map(found.get, range(len(kind._fields)))) for found in sums], magnified
 
 
 def _diagonal(A: np.ndarray) -> np.ndarray:

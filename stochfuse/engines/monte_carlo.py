@@ -1,9 +1,8 @@
 """Monte Carlo: draw the events, evaluate the estimator, average.  The cross-check; it imports no other engine.
 
 Runs with equal histories are evaluated once: at every step runs are gathered by (state, what arrived), and states
-that will
-behave alike are taken together while that saves work.  Random numbers are drawn in blocks, each with its own seed, so
-that the sample depends on the seed alone and not on the number of workers.
+that will behave alike are taken together while that saves work.  Random numbers are drawn in blocks, each with its own
+seed, so that the sample depends on the seed alone and not on the number of workers.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from stochfuse.engines import uncollected
 from stochfuse.estimators import Estimator, Exchange, Late
 from stochfuse.events import Event
 from stochfuse.information import Ledger, Sources, check_definite, evaluate
-from stochfuse.kalman import from_information
+from stochfuse.kalman import Estimate, Information, from_information
 
 BLOCK = 1000
 """Runs drawn from one seed."""
@@ -43,6 +42,8 @@ class Experiment(NamedTuple):
     delay : probabilities of 0, 1, 2 … steps of delay.
     estimator : makes the estimator from a ledger.
     sources : what start and measurements are worth.
+    of : makes what is kept of every estimate, a named tuple of arrays or Nones, of a stack of estimates.
+    kinds : kind of each source, where sources are agents that may change places, see `Ledger`.
     runs, seed : size of the sample per row, and its seed.
     """
 
@@ -51,20 +52,22 @@ class Experiment(NamedTuple):
     delay: tuple[float, ...]
     estimator: Callable[[Ledger], Estimator]
     sources: Sources
+    of: Callable[[Estimate], Any]
+    kinds: tuple[int, ...] | None
     runs: int
     seed: int
 
 
 class Sample(NamedTuple):
-    """Claimed covariances of every run.
+    """What is kept of the estimates of every run.
 
     Parameters
     ----------
-    values : (values, d, d) different covariances.
-    which : (rows, runs, steps, agents) which of them each agent claims.
+    values : named tuple of arrays (values, …), the different ones.
+    which : (rows, runs, steps, agents) which of them each agent has.
     """
 
-    values: np.ndarray
+    values: Any
     which: np.ndarray
 
 
@@ -83,7 +86,7 @@ def sample(
     share = min(MOST_BLOCKS, max(1, -(-len(blocks) // max(1, workers))))
     parts = [blocks[first : first + share] for first in range(0, len(blocks), share)]
     index = np.empty((rows, experiment.runs, len(experiment.events), experiment.agents), np.int32)
-    values: list[np.ndarray] = []
+    values: list[Any] = []
     pool: Any = (
         ProcessPoolExecutor(min(workers, len(parts)), initializer=_quietly)
         if min(workers, len(parts)) > 1
@@ -95,16 +98,17 @@ def sample(
         else:
             tasks = [executor.submit(run_blocks, experiment, part) for part in parts]
             found = (task.result() for task in tasks)
-        for done, (part, (P, which)) in enumerate(zip(parts, found, strict=True), start=1):
-            which, first = which + sum(map(len, values)), 0
+        for done, (part, (kept, which)) in enumerate(zip(parts, found, strict=True), start=1):
+            which, first = which + sum(len(v[0]) for v in values), 0
             for row, block in part:
                 runs = _runs_of(block, experiment.runs)
                 index[row, block * BLOCK : block * BLOCK + runs] = which[first : first + runs]
                 first += runs
-            values.append(P)
+            values.append(kept)
             if progress:
                 progress(done, len(parts))
-    return Sample(np.concatenate(values), index)
+    columns = zip(*values, strict=True)
+    return Sample(type(values[0])(*(None if c[0] is None else np.concatenate(c) for c in columns)), index)
 
 
 @contextmanager
@@ -123,14 +127,14 @@ def _quietly() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def run_blocks(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
-    """Covariances and their index (runs, steps, agents) for some (row, block) pairs."""
+def run_blocks(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tuple[Any, np.ndarray]:
+    """What is kept, and its index (runs, steps, agents), for some (row, block) pairs."""
     with uncollected():
         return _run_blocks(experiment, blocks)
 
 
-def _run_blocks(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
-    ledger = Ledger()
+def _run_blocks(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tuple[Any, np.ndarray]:
+    ledger = Ledger(experiment.kinds)
     estimator = experiment.estimator(ledger)
     drawn = [_draw(experiment, row, block) for row, block in blocks]
     runs = sum(len(steps[0]) for steps in drawn)
@@ -153,8 +157,9 @@ def _run_blocks(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tu
     information = evaluate(ledger, experiment.sources)
     for step in range(1, len(experiment.events) + 1):
         check_definite(information.Y[np.unique(claimed[:, step - 1])], step)
-    P = from_information(information._replace(Y=information.Y[used])).P
-    return P, index.reshape(claimed.shape).astype(np.int32)
+    y = None if information.y is None else information.y[used]
+    kept = experiment.of(from_information(Information(y, information.Y[used])))
+    return kept, index.reshape(claimed.shape).astype(np.int32)
 
 
 class _Histories:

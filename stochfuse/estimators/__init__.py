@@ -39,6 +39,10 @@ class Exchange(Protocol):
         """Open the next exchange, nothing merged and nobody moved."""
         ...
 
+
+class AdditiveExchange(Exchange, Protocol):
+    """The exchange of an additive estimator."""
+
     def union(self, heard: int) -> int:
         """Value of what would be fused from the agents heard, whoever hears them (no message under way)."""
         ...
@@ -56,12 +60,15 @@ class Estimator(Protocol):
     ledger : where values are written.
     sources : source (of start and measurements) of every agent.
     removes : whether anything is taken for common and removed.
+    additive : whether what agents claim after an exchange is a sum of what they and what they have in common brought
+        there, so that `union` and `common` tell everything.
     relabellings : permutations of the agents that leave network and sources as they are.
     """
 
     ledger: Ledger
     sources: tuple[int, ...]
     removes: bool
+    additive: bool
     relabellings: Sequence[tuple[int, ...]]
 
     def start(self) -> Any:

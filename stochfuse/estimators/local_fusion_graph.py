@@ -28,7 +28,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from stochfuse.estimators import Late, best_relabelling
-from stochfuse.information import Ledger
+from stochfuse.information import COMMON, Ledger
 
 
 class Agent(NamedTuple):
@@ -117,7 +117,7 @@ class LocalFusionGraph:
     relabellings : permutations of the agents that leave network and sources as they are.
     """
 
-    removes = True
+    removes, additive = True, True
 
     def __init__(
         self,
@@ -133,7 +133,7 @@ class LocalFusionGraph:
     def start(self) -> State:
         """Everyone's initial estimate; a shared one is a common ancestor of all."""
         if self.shared:
-            root = self.ledger.start(self.sources[0])
+            root = self.ledger.start(COMMON)
             return State(((root, 1),), tuple(Agent(root, 1) for _ in self.sources))
         return State((), tuple(Agent(self.ledger.start(source), 0) for source in self.sources))
 
@@ -237,11 +237,11 @@ class GraphExchange:
             for node in nodes
         ]
         # ancestors first: an earlier step, or fewer ancestors within one
-        rank = [(step[values[node]], (below[node] & kept).bit_count(), values[node]) for node in nodes]
+        ledger = self.estimator.ledger
+        rank = [(step[values[n]], (below[n] & kept).bit_count(), ledger.invariant(values[n])) for n in nodes]
         invariants = [
             (
-                agent.value,
-                self.estimator.sources[i],
+                ledger.invariant(agent.value),
                 sorted((rank[p], holders[p].bit_count()) for p in range(len(nodes)) if holders[p] >> i & 1),
                 sorted(left for r, left in waiting if r == i),
             )
@@ -260,8 +260,8 @@ class GraphExchange:
             sequence = _sequence(keys, nodes, below)
             new = {nodes[p]: place for place, p in enumerate(sequence)}
             state = State(
-                tuple((values[nodes[p]], _moved(below[nodes[p]] & kept, new)) for p in sequence),
-                tuple(Agent(agents[i].value, _moved(agents[i].known & kept, new)) for i in order),
+                tuple((ledger.moved(values[nodes[p]], order), _moved(below[nodes[p]] & kept, new)) for p in sequence),
+                tuple(Agent(ledger.moved(agents[i].value, order), _moved(agents[i].known & kept, new)) for i in order),
                 tuple(sorted((place_of[r], left, _moved(m & kept, new)) for (r, left), m in waiting.items())),
             )
             if best is None or state < best[0]:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from stochfuse.estimators import Late, best_relabelling
-from stochfuse.information import Ledger
+from stochfuse.information import COMMON, Ledger
 
 
 class State(NamedTuple):
@@ -25,7 +25,7 @@ class State(NamedTuple):
 class NaiveFusion:
     """The estimator; parameters are those of `LocalFusionGraph`.  A shared start is not recognised as such."""
 
-    removes = False
+    removes, additive = False, True
 
     def __init__(
         self,
@@ -35,12 +35,12 @@ class NaiveFusion:
         shared: bool = False,
         relabellings: Sequence[tuple[int, ...]] | None = None,
     ) -> None:
-        self.ledger, self.sources = ledger, tuple(sources)
+        self.ledger, self.sources, self.shared = ledger, tuple(sources), shared
         self.relabellings = relabellings or [tuple(range(len(self.sources)))]
 
     def start(self) -> State:
         """Everyone's initial estimate."""
-        return State(tuple(self.ledger.start(source) for source in self.sources))
+        return State(tuple(self.ledger.start(COMMON if self.shared else source) for source in self.sources))
 
     def exchange(self, state: State) -> NaiveExchange:
         """Open the exchange of the state's step."""
@@ -81,15 +81,16 @@ class NaiveExchange:
     def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[State, tuple[int, ...]]:
         """State before the next exchange, in the order that like states share, and the agent at each place of it."""
         agents, under_way = self._next(heard, late)
+        ledger = self.estimator.ledger
         invariants = [
-            (agents[i], self.estimator.sources[i], sorted((left, value) for r, left, value in under_way if r == i))
+            (ledger.invariant(agents[i]), sorted((left, ledger.invariant(v)) for r, left, v in under_way if r == i))
             for i in range(len(agents))
         ]
         states = []
         for order in best_relabelling(invariants, self.estimator.relabellings):
             place = {i: p for p, i in enumerate(order)}
-            late_now = tuple(sorted((place[r], left, value) for r, left, value in under_way))
-            states.append((State(tuple(agents[i] for i in order), late_now), order))
+            late_now = tuple(sorted((place[r], left, ledger.moved(value, order)) for r, left, value in under_way))
+            states.append((State(tuple(ledger.moved(agents[i], order) for i in order), late_now), order))
         return min(states)
 
     def onward(self, heard: Sequence[int], late: Sequence[Late] = ()) -> NaiveExchange:

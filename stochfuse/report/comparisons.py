@@ -198,8 +198,9 @@ def draw(view: ComparisonView):
                 bars = 1.96 * along(errors, c) * scale
                 right.errorbar(x, along(differences[m], c), bars, color=color, capsize=2, **style)
     unit = f" [{first.unit}]" if first.unit else ""
-    left.set_ylabel(first.metric.label.partition(" (")[0] + unit)
-    left.set_ylim(bottom=0)
+    left.set_ylabel(first.noun.partition(" (")[0] + unit)
+    if values.min() >= 0:
+        left.set_ylim(bottom=0)
     right.axhline(0, color="0.3", linewidth=0.8)
     right.set_ylabel(f"difference from {p.method}" + (" [%]" if view.relative else unit))
     for axes in (left, right):

@@ -12,6 +12,8 @@ from stochfuse.distribution import parse_statistic
 from stochfuse.errors import StochfuseError, UsageError
 from stochfuse.metrics import Metric, power
 from stochfuse.prediction import Prediction
+from stochfuse.quantities import OVERCONFIDENT, expectation, noun, title
+from stochfuse.quantities import unit as unit_of
 from stochfuse.report.table import Table, number, to_csv
 
 SCHEMA = "stochfuse.prediction/1"
@@ -66,7 +68,8 @@ class View:
         """Unit of the values; empty where there is none."""
         if self.baseline or self.statistic.startswith("at-most"):
             return ""
-        return power(self.metric.unit, 2) if self.statistic == "variance" else self.metric.unit
+        own = unit_of(self.prediction.quantity, self.metric)
+        return power(own, 2) if self.statistic == "variance" else own
 
     def errors(self) -> np.ndarray | None:
         """Standard errors of the values where they are sampled, shape (links, steps)."""
@@ -81,6 +84,21 @@ class View:
             return _finite(self.prediction.statistic(self.statistic, self.metric, self.agent))
         values = self.prediction.values(self.metric, self.agent)
         return _finite(self._normalised(values, self.baseline and self.baseline.values(self.metric, self.agent)))
+
+    def overconfidence(self) -> str:
+        """Return a sentence if more is claimed than is true by over 5 %, where both are known; else nothing."""
+        p = self.prediction
+        if p.moments.actual is None or p.method in ("simplified", "optimal"):
+            return ""
+        ratio = p.shown_as("consistency").values(self.metric, self.agent)
+        if ratio.max() <= OVERCONFIDENT:
+            return ""
+        row, step = np.unravel_index(ratio.argmax(), ratio.shape)
+        where = f"µ = {p.link[row]:.6g}" if p.cases is None else p.cases[row]
+        return (
+            f"overconfident: the actual {self.metric.label} is up to {ratio.max():.3g} times the claimed one ({where}, "
+            f"step {p.steps[step]})"
+        )
 
     def steady(self) -> np.ndarray | None:
         """Steady-state values, shape (links,), or None."""
@@ -98,17 +116,24 @@ class View:
 
     @property
     def what(self) -> str:
-        """One line: which covariance, of which states, in which unit."""
+        """One line: which quantity, of which states, in which unit."""
         p = self.prediction
         unit = f" [{self.unit}]" if self.unit else ", relative to link probability 0" if self.baseline else ""
-        if not unit:
+        if not unit and p.quantity != "consistency":
             unit = " [mixed units]" if self.metric.mixed else "" if any(p.scenario.model.units) else " [no unit given]"
         if self.statistic == "mean":
-            return f"Expected {p.quantity} {p.stage} covariance: {self.metric.label}{unit}"
-        kind, number = parse_statistic(self.statistic)
-        own = f" {self.metric.unit}" if self.metric.unit else ""
-        text = STATISTICS[kind].format(what=self.metric.label, number=f"{number:.12g}", unit=own)
-        return f"{p.quantity.capitalize()} {p.stage} covariance: {text}" + ("" if kind == "at-most" else unit)
+            text, heading = self.noun, "expected " * expectation(p.quantity) + title(p.quantity, p.stage)
+        else:
+            kind, number = parse_statistic(self.statistic)
+            own = unit_of(p.quantity, self.metric)
+            text = STATISTICS[kind].format(what=self.noun, number=f"{number:.12g}", unit=f" {own}" if own else "")
+            heading, unit = title(p.quantity, p.stage), "" if kind == "at-most" else unit
+        return f"{heading[0].upper()}{heading[1:]}: {text}{unit}"
+
+    @property
+    def noun(self) -> str:
+        """What of the quantity is shown, in words."""
+        return noun(self.prediction.quantity, self.metric)
 
     @property
     def whom(self) -> str:
