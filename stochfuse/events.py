@@ -6,7 +6,8 @@ sender, at once or after a delay that is drawn with it.  Sets of agents are mask
 
 With equal µ everywhere, an outcome with c successes of L events has probability µ^c (1−µ)^(L−c): the `Counts` and
 `Coefficients` weights keep the factor of every c apart (theory section 5), so that one enumeration answers every µ.
-`Rows` keeps one probability per row of link probabilities instead.
+`Rows` keeps one probability per row of link probabilities instead, and `Bursty` one for every row and every way in which
+the links can be good and bad.
 """
 
 from __future__ import annotations
@@ -18,19 +19,28 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from stochfuse.errors import UsageError
 from stochfuse.estimators import Late
 from stochfuse.network import LinkRows, Network, possible_senders
 
+MOST_HIDDEN = 1 << 14
+"""Rows times ways in which bursty links can be good and bad."""
 MOST_AGENTS_RELABELLED = 7
 """Agents up to which relabellings are looked for: their number grows with the factorial."""
 
 
 class Event(NamedTuple):
-    """One draw of a step: who sends, who hears it, and with which probability in each row."""
+    """One draw of a step: who sends, who hears it, and with which probability in each row.
+
+    Of a bursty link `probability` is the mean; `burst` (rows, 4) says how it comes about, and `number` which link it is
+    among those of every step.
+    """
 
     sender: int
     receivers: tuple[int, ...]
     probability: np.ndarray
+    burst: np.ndarray | None = None
+    number: int = 0
 
 
 class Fate(NamedTuple):
@@ -59,6 +69,8 @@ def events(network: Network, rows: LinkRows, step: int) -> list[Event]:
         found = [Event(j, heard, µ[:, heard[0], place[heard[0], j]]) for j, heard in listeners.items() if heard]
     else:
         found = [Event(int(j), (i,), µ[:, i, p]) for i in range(n) for p, j in enumerate(senders[i])]
+    if rows.bursts is not None:
+        return [e._replace(burst=rows.chain(e.probability), number=number) for number, e in enumerate(found)]
     # with one µ for all links the answer is a polynomial in µ, whatever values of µ are asked for
     return [event for event in found if rows.uniform or (event.probability > 0).any()]
 
@@ -100,7 +112,21 @@ def orbits(n: int, permutations: Sequence[tuple[int, ...]]) -> list[tuple[int, .
     return [tuple(i for i in range(n) if group[i] == g) for g in sorted(set(group))]
 
 
-class _Polynomial:
+class _Memoryless:
+    """Weights of links whose steps are independent."""
+
+    memory = False
+
+    def between(self, weights: list[Any]) -> list[Any]:
+        """Weights of states before the next step's exchange, from those after this one's."""
+        return weights
+
+    def collected(self, total: np.ndarray) -> np.ndarray:
+        """Return what is known on the weights' axis without what is hidden."""
+        return total
+
+
+class _Polynomial(_Memoryless):
     """Coefficients A_c of µ^c (1−µ)^(L−c) on an axis of L + 1 entries."""
 
     def product(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -202,7 +228,7 @@ class Coefficients(_Polynomial):
 
 
 @dataclass(frozen=True)
-class Rows:
+class Rows(_Memoryless):
     """Weights as one probability per row."""
 
     rows: int
@@ -245,7 +271,71 @@ class Rows:
         return total
 
 
+@dataclass(frozen=True)
+class Bursty(Rows):
+    """Weights as one probability per row and hidden state, which says of every link (bit by its number) if it is bad.
+
+    Parameters
+    ----------
+    rows : entries of the axis: rows times hidden states.
+    links : number of links.
+    moves : (links, rows proper, 2, 2) probability to go from state to state (0 good, 1 bad).
+    """
+
+    links: int
+    moves: np.ndarray
+
+    memory = True
+
+    def one(self) -> np.ndarray:
+        """Stationary distribution of the hidden states, in every row."""
+        total = np.ones((self.moves.shape[1], 1))
+        for move in self.moves:  # a later link is a higher bit
+            bad = move[:, 0, 1] / (move[:, 0, 1] + move[:, 1, 0])
+            total = np.concatenate([total * (1.0 - bad)[:, None], total * bad[:, None]], axis=1)
+        return total.ravel()
+
+    def factor(self, event: Event, fate: Fate) -> np.ndarray:
+        """Probabilities of one event's fate in every hidden state."""
+        if event.burst is None:
+            raise ValueError("expected an event of a bursty link")
+        bad = np.arange(1 << self.links) >> event.number & 1
+        µ = np.where(bad, event.burst[:, 3:], event.burst[:, 2:3]).ravel()
+        return fate.missed * (1.0 - µ) + fate.arrived * µ
+
+    def between(self, weights: list[Any]) -> list[Any]:
+        """Let every link stay or change."""
+        rows, links = self.moves.shape[1], self.links
+        table = np.array(weights)
+        for link, move in enumerate(self.moves):
+            parts = table.reshape(len(weights), rows, 1 << (links - 1 - link), 2, 1 << link)
+            table = np.einsum("wrasb,rst->wratb", parts, move).reshape(len(weights), -1)
+        return list(table)
+
+    def collected(self, total: np.ndarray) -> np.ndarray:
+        """Sum over the hidden states."""
+        return total.reshape(self.moves.shape[1], -1, *total.shape[1:]).sum(axis=1)
+
+
 Weights = Counts | Coefficients | Rows
+
+
+def bursty(drawn: Sequence[Event], rows: int) -> Bursty:
+    """Return the bookkeeping for bursty links.
+
+    Raises
+    ------
+    UsageError
+        If the hidden states are too many.
+    """
+    if rows << len(drawn) > MOST_HIDDEN:
+        raise UsageError(
+            f"{len(drawn)} bursty links are good and bad in 2^{len(drawn)} ways, for {rows} rows too many to go through "
+            f"(at most {MOST_HIDDEN}): use --method optimal or --method monte-carlo"
+        )
+    bursts = [event.burst for event in drawn if event.burst is not None]
+    moves = np.array([[[[1 - g, g], [b, 1 - b]] for g, b, _, _ in burst] for burst in bursts])
+    return Bursty(rows << len(drawn), len(drawn), moves.reshape(len(drawn), rows, 2, 2))
 
 
 def weights_for(network: Network, rows: LinkRows, number_of_events: int) -> Weights:

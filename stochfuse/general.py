@@ -36,6 +36,7 @@ from stochfuse.events import (
     MOST_AGENTS_RELABELLED,
     Rows,
     bernstein,
+    bursty,
     events,
     monomials,
     orbits,
@@ -173,7 +174,7 @@ class Outcomes:
         return 1.0 - self._kept()
 
     def _kept(self) -> np.ndarray:
-        return np.stack([ending.weights.sum(axis=0) for ending in self.structure.endings], axis=1)
+        return np.stack([self.weights.collected(e.weights.sum(axis=0)) for e in self.structure.endings], axis=1)
 
     def statistic(self, name: str, metric: Metric, groups: Sequence[int], quantity: str = "claimed") -> np.ndarray:
         """Return a statistic of a metric over the outcomes, (rows, steps).
@@ -250,7 +251,8 @@ class Outcomes:
             cells = np.repeat(self._probability(view.factors, rows), np.diff([*view.starts, found.shape[1]]), axis=1)
             last = sum(part * self._probability(share[None], rows) for share, part in shares)
             values.append(found.ravel())
-            weights.append((before[:, :, None] * (cells * last)[:, None, :]).reshape(len(before), -1))
+            both = before[:, :, None] * (cells * last)[:, None, :]
+            weights.append(self._collected(both.reshape(len(both), -1), rows))
         merged = Distribution.merged(np.concatenate(values), np.concatenate(weights, axis=1))
         return Distribution(merged.values, merged.probability / merged.probability.sum(axis=1, keepdims=True))
 
@@ -258,7 +260,15 @@ class Outcomes:
         """Probabilities (rows, entries) of entries given on the weights' axis."""
         if self.polynomial:
             return monomials(table.shape[1] - 1, self.rows.link[rows]) @ table.T
-        return table.T[rows]
+        if not self.weights.memory:
+            return table.T[rows]
+        links = len(self.rows.link)
+        return table.T.reshape(links, -1, len(table))[rows].reshape(-1, len(table))
+
+    def _collected(self, probability: np.ndarray, rows: slice) -> np.ndarray:
+        """Sum over what is hidden of the links, (rows, entries)."""
+        chosen = len(range(*rows.indices(len(self.rows.link))))
+        return probability.reshape(chosen, -1, probability.shape[1]).sum(axis=1)
 
     def _at(self, expected: np.ndarray, link: np.ndarray | None) -> np.ndarray:
         if not self.polynomial:
@@ -320,11 +330,16 @@ def outcomes(
     permutations = relabellings(network, rows, scenario.sensor_of if records is None else everyone)
     labels = everyone if errors or records is not None else scenario.sensor_of
     ledger = Ledger(scenario.sensor_of if errors else None)
+    # a bursty link keeps its state where it is: nobody may change places
+    fixed = plain or rows.bursts is not None
     made = ESTIMATORS[estimator](
-        ledger, labels, shared=scenario.correlation == "shared", relabellings=None if plain else permutations
+        ledger, labels, shared=scenario.correlation == "shared", relabellings=None if fixed else permutations
     )
     per_step = [events(network, rows, step) for step in range(1, network.steps + 1)]
-    weights = Rows(len(rows.link)) if prune else weights_for(network, rows, sum(map(len, per_step)))
+    if rows.bursts is not None:
+        weights = bursty(per_step[0], len(rows.link))
+    else:
+        weights = Rows(len(rows.link)) if prune else weights_for(network, rows, sum(map(len, per_step)))
     groups = groups_alike(network, rows, scenario.sensor_of if records is None else everyone, permutations)
     request = Request(
         agents=network.agents,

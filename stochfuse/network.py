@@ -3,14 +3,20 @@
 Architectures (thesis 3.1): *ad-hoc* draws every ordered pair of agents, *broadcast* draws every sender once and
 everyone hears it, *cyclic* lets agent j hear agent j+1 only.  A matrix of link probabilities has the receiver in
 its row and the sender in its column, µ_ij of (44); its diagonal is ignored.
+
+Bursty links follow the two-state model of Gilbert and Elliott: every link is good or bad on its own, goes from good to bad
+with probability g and from bad to good with probability b in each step, and delivers with a probability of each state.
+It starts from its stationary distribution, (b, g)/(g + b), and so delivers with the same mean probability at every step.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+
+from stochfuse.errors import UsageError
 
 ARCHITECTURES = ("ad-hoc", "broadcast", "cyclic")
 DEFAULT_LINKS = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -28,6 +34,8 @@ class Network:
     link : probability of shape (), (n, n), (steps,) or (steps, n, n); None where it is to be tabulated.
     cases : named alternatives to `link`.
     delay : probabilities of a delay of 0, 1, 2 … steps.
+    burst : (4,) good→bad, bad→good, delivery in good, delivery in bad; None for links without memory.
+    case_bursts : the same for each of the cases.
     """
 
     agents: int
@@ -36,6 +44,8 @@ class Network:
     link: np.ndarray | None
     cases: tuple[tuple[str, np.ndarray], ...] = ()
     delay: tuple[float, ...] = (1.0,)
+    burst: np.ndarray | None = None
+    case_bursts: tuple[np.ndarray | None, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -45,11 +55,13 @@ class LinkRows:
     Parameters
     ----------
     names : a name per row where rows are cases, else None.
-    link : probabilities of shape (rows,), (rows, steps), (rows, n, n) or (rows, steps, n, n).
+    link : probabilities of shape (rows,), (rows, steps), (rows, n, n) or (rows, steps, n, n); of bursty links the mean.
+    bursts : (rows,) bursts, None for a row of links without memory; None if there is no other row.
     """
 
     names: tuple[str, ...] | None
     link: np.ndarray
+    bursts: tuple[np.ndarray | None, ...] | None = None
 
     @property
     def uniform(self) -> bool:
@@ -60,6 +72,15 @@ class LinkRows:
     def varies(self) -> bool:
         """Whether the probabilities depend on the step."""
         return self.link.ndim in (2, 4)
+
+    def chain(self, µ: np.ndarray) -> np.ndarray | None:
+        """Good→bad, bad→good, delivery in good and in bad, (rows, 4), of a link whose mean probability is µ in each row.
+
+        None if no row has a memory; a row without is one whose two states deliver alike.
+        """
+        if self.bursts is None:
+            return None
+        return np.array([(0.5, 0.5, m, m) if b is None else b for m, b in zip(µ, self.bursts, strict=True)])
 
     def at_step(self, step: int) -> np.ndarray:
         """Probabilities at a step, shape (rows,) if uniform, else (rows, receiver, sender)."""
@@ -103,13 +124,47 @@ def number_of_senders(architecture: str, agents: int) -> int:
     return min(1, agents - 1) if architecture == "cyclic" else agents - 1
 
 
+def require_memoryless(rows: LinkRows, who: str, why: str) -> None:
+    """Raise UsageError if some links are bursty."""
+    if rows.bursts is not None:
+        raise UsageError(f"{who} does not take bursty links (network.burst): {why}")
+
+
+def mean_delivery(burst: np.ndarray) -> np.ndarray:
+    """Stationary probability of a delivery, from (..., 4) bursts."""
+    good_to_bad, bad_to_good, good, bad = np.moveaxis(burst, -1, 0)
+    return (bad_to_good * good + good_to_bad * bad) / (good_to_bad + bad_to_good)
+
+
+def delivery_after_failures(burst: np.ndarray, most: int) -> np.ndarray:
+    """Probability of a delivery after 0, 1 … most failures in a row, of (rows, 4) bursts, shape (rows, most + 1).
+
+    A chain of two states is reversible, so that the row of failures may lie in the past or in the future.
+    """
+    good_to_bad, bad_to_good, *delivery = np.moveaxis(burst, -1, 0)
+    deliver = np.stack(delivery, axis=1)
+    move = np.array([[1.0 - good_to_bad, good_to_bad], [bad_to_good, 1.0 - bad_to_good]]).transpose(2, 0, 1)
+    state = np.stack([bad_to_good, good_to_bad], axis=1) / (good_to_bad + bad_to_good)[:, None]
+    out = []
+    for _ in range(most + 1):
+        out.append((state * deliver).sum(axis=1))
+        failed = state * (1.0 - deliver)
+        total = failed.sum(axis=1, keepdims=True)
+        # where failures cannot happen, what would follow them does not matter
+        state = np.divide(failed, total, out=state.copy(), where=total > 0)
+        state = np.einsum("rs,rst->rt", state, move)
+    return np.stack(out, axis=1)
+
+
 def default_rows(network: Network) -> LinkRows:
     """Rows that a scenario asks for itself: its cases, its link probability, or the thesis' five."""
     if network.cases:
         names, arrays = zip(*network.cases, strict=True)
-        return stacked_rows(names, arrays, network)
+        rows = stacked_rows(names, arrays, network)
+        return replace(rows, bursts=network.case_bursts if any(b is not None for b in network.case_bursts) else None)
     if network.link is not None:
-        return stacked_rows(None, [network.link], network)
+        rows = stacked_rows(None, [network.link], network)
+        return rows if network.burst is None else replace(rows, bursts=(network.burst,))
     return uniform_rows(DEFAULT_LINKS)
 
 

@@ -26,7 +26,15 @@ from stochfuse.checks import Checker, shown
 from stochfuse.errors import Problem, ScenarioError, UsageError
 from stochfuse.metrics import metric as metric_of
 from stochfuse.model import Model, Sensor
-from stochfuse.network import ARCHITECTURES, LinkRows, Network, default_rows, stacked_rows, uniform_rows
+from stochfuse.network import (
+    ARCHITECTURES,
+    LinkRows,
+    Network,
+    default_rows,
+    mean_delivery,
+    stacked_rows,
+    uniform_rows,
+)
 
 SCHEMA = "stochfuse.scenario/1"
 DEFAULT = "thesis-transient"
@@ -236,7 +244,7 @@ def _override(mapping: dict[str, Any], overrides: Mapping[str, Any]) -> dict[str
     }
     network = mapping.get("network")
     if overrides.get("uniform_link") and isinstance(network, dict):
-        mapping["network"] = {key: value for key, value in network.items() if key not in ("link", "case")}
+        mapping["network"] = {key: value for key, value in network.items() if key not in ("link", "case", "burst")}
     for key, value in overrides.items():
         if value is None or key == "uniform_link":
             continue
@@ -301,21 +309,56 @@ def _network(check: Checker, table: Mapping[str, Any]) -> Network | None:
             check.link("network.link", table["link"], 1, 1)
         return None
     link = _link(check, "network.link", table.get("link"), agents, steps, architecture)
-    cases = []
+    burst = _burst(check, "network", table)
+    link = link if burst is None else mean_delivery(burst)
+    cases, bursts = [], []
     for i, case in enumerate(table.get("case") or [], start=1):
         if not isinstance(case, dict):
             continue
         path = f"network.case[{i}].link"
         own = link if case.get("link") is None else _link(check, path, case["link"], agents, steps, architecture)
+        bursty = burst if case.get("link") is None else None
+        if case.get("burst") is not None:
+            bursty = _burst(check, f"network.case[{i}]", case)
+            own = own if bursty is None else mean_delivery(bursty)
         name = str(case.get("name", i))
         check.name(f"network.case[{i}].name", name)
         if name in [other for other, _ in cases]:
             check.note(f"network.case[{i}].name", "a name of its own", shown(name))
-        if own is None and case.get("link") is None:
+        if own is None and case.get("link") is None and case.get("burst") is None:
             check.note(path, "a link probability here or in network.link", "nothing")
         elif own is not None:
             cases.append((name, own))
-    return Network(agents, steps, architecture, link, tuple(cases), _delay(check, table.get("delay")))
+            bursts.append(bursty)
+    delay = _delay(check, table.get("delay"))
+    return Network(agents, steps, architecture, link, tuple(cases), delay, burst, tuple(bursts))
+
+
+def _burst(check: Checker, path: str, table: Mapping[str, Any]) -> np.ndarray | None:
+    given = table.get("burst")
+    if not isinstance(given, dict):
+        return None
+    path = f"{path}.burst"
+    if table.get("link") is not None:
+        check.note(path, "either a link probability or a burst", "both")
+    keys = {"good_to_bad": None, "bad_to_good": None, "good": 1.0, "bad": 0.0}
+    values = []
+    for key, default in keys.items():
+        value = given.get(key, default)
+        if value is None:
+            check.note(f"{path}.{key}", "a probability", "nothing")
+            continue
+        number = check.array(f"{path}.{key}", value, "a probability")
+        if number is not None and (number.ndim or not 0 <= number <= 1):
+            check.note(f"{path}.{key}", "a probability", shown(value))
+        elif number is not None:
+            values.append(float(number))
+    if len(values) < len(keys):
+        return None
+    if values[0] + values[1] == 0:
+        check.note(path, "good_to_bad or bad_to_good above 0, so that the share of good steps is known", "0 for both")
+        return None
+    return np.array(values)
 
 
 def _link(check: Checker, path: str, value: Any, agents: int, steps: int, architecture: str) -> np.ndarray | None:

@@ -48,11 +48,21 @@ class InitialTable(_Table):
     error: Vector | None = Field(None, description="known initial error (bias), common to all agents")
 
 
+class BurstTable(_Table):
+    """A bursty link (Gilbert and Elliott): good or bad, with a memory; each link on its own."""
+
+    good_to_bad: Number = Field(description="probability that a good link is bad in the next step")
+    bad_to_good: Number = Field(description="probability that a bad link is good in the next step")
+    good: Number = Field(1.0, description="delivery probability of a good link")
+    bad: Number = Field(0.0, description="delivery probability of a bad link")
+
+
 class CaseTable(_Table):
     """A named alternative to network.link."""
 
     name: str
     link: Link | None = Field(None, description="as network.link; default network.link itself")
+    burst: BurstTable | None = Field(None, description="as network.burst, instead of a link")
 
 
 class NetworkTable(_Table):
@@ -66,6 +76,7 @@ class NetworkTable(_Table):
         description="link probability: a number, a matrix (row: receiver, column: sender), or one of either per step; "
         "left out, it is tabulated from 0 to 1",
     )
+    burst: BurstTable | None = Field(None, description="bursty links, instead of a link probability")
     delay: Number | list[Number] | None = Field(
         None, description="delay of messages in steps, or the probabilities of a delay of 0, 1, 2 … steps"
     )

@@ -38,7 +38,7 @@ from stochfuse.arrivals import Counts, like_senders, poisson_binomial
 from stochfuse.engines.mean_field import Case, Outcomes, run, run_like
 from stochfuse.errors import UsageError
 from stochfuse.kalman import Estimate, from_information, to_information, update, update_information
-from stochfuse.network import LinkRows, number_of_senders, possible_senders
+from stochfuse.network import LinkRows, number_of_senders, possible_senders, require_memoryless
 from stochfuse.scenario import Scenario
 
 MOST_OUTCOMES = 100_000
@@ -169,6 +169,11 @@ def groups(scenario: Scenario, rows: LinkRows) -> list[Group]:
     if network.delay[0] != 1.0:
         raise UsageError("method 'simplified' is derived without delay (thesis 4.2); network.delay must be 0")
     steps = range(1, network.steps + 1)
+    require_memoryless(
+        rows,
+        "method 'simplified'",
+        "it averages after every step and forgets which links were bad; use general, optimal or monte-carlo",
+    )
     shared = scenario.correlation == "shared"
     if len(scenario.sensors) == 1 and rows.uniform:
         senders = number_of_senders(network.architecture, network.agents)

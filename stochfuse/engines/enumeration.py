@@ -141,7 +141,13 @@ def _enumerate(estimator: Estimator, request: Request, progress: Progress) -> St
     number = [1]
     for step, d in enumerate(drawn, start=1):
         number.append(number[-1] * len(fates(request.delay, steps - step)) ** len(d))
-    two_steps = estimator.additive and request.delay == (1.0,) and n <= MOST_GENERATORS and not request.plain
+    two_steps = (
+        estimator.additive
+        and not weights.memory
+        and request.delay == (1.0,)
+        and n <= MOST_GENERATORS
+        and not request.plain
+    )
     start = estimator.start()
     layer: dict[Any, Any] = {estimator.exchange(start) if request.plain else start: weights.one()}
     sizes, announced = [1], False
@@ -166,6 +172,7 @@ def _enumerate(estimator: Estimator, request: Request, progress: Progress) -> St
                 announced = True
             possible = outcomes(before, n, request.delay, left, weights)
             layer = _next_layer(estimator, layer, possible, step - 1, request, progress)
+            layer = dict(zip(layer, weights.between(list(layer.values())), strict=True)) if weights.memory else layer
             if request.prune and len(layer) > request.most:
                 layer = _likeliest(layer, request.most)
             _check_size(len(layer), number[steps], request)
@@ -459,7 +466,8 @@ def expectation(
                 if share is not None:
                     part = weights.completed(weights.weighed(total, share), ending.events)
                     sums[group][place] = sums[group][place] + part if place in sums[group] else part
-    return [kind(*map(found.get, range(len(kind._fields)))) for found in sums], magnified
+    known = [{place: weights.collected(total) for place, total in found.items()} for found in sums]
+    return [kind(*map(found.get, range(len(kind._fields)))) for found in known], magnified
 
 
 def _diagonal(A: np.ndarray) -> np.ndarray:

@@ -242,9 +242,15 @@ def _draw(experiment: Experiment, row: int, block: int) -> list[np.ndarray]:
     """Fates of a block's events per step, (runs, events): 0 lost, 1 + delay otherwise."""
     generator = np.random.default_rng(np.random.SeedSequence(experiment.seed, spawn_key=(row, block)))
     runs, delays = _runs_of(block, experiment.runs), np.cumsum(experiment.delay)
-    out = []
+    out, bad = [], None
     for events in experiment.events:
         µ = np.array([event.probability[row] for event in events])
+        bursts = [event.burst[row] for event in events if event.burst is not None]
+        if bursts:
+            to_bad, to_good, good_µ, bad_µ = np.array(bursts).T
+            change = to_bad / (to_bad + to_good) if bad is None else np.where(bad, 1.0 - to_good, to_bad)
+            bad = generator.random((runs, len(events))) < change
+            µ = np.where(bad, bad_µ, good_µ)
         arrived = generator.random((runs, len(events))) < µ
         late = 0
         if len(delays) > 1:
