@@ -6,8 +6,8 @@ sender, at once or after a delay that is drawn with it.  Sets of agents are mask
 
 With equal µ everywhere, an outcome with c successes of L events has probability µ^c (1−µ)^(L−c): the `Counts` and
 `Coefficients` weights keep the factor of every c apart (theory section 5), so that one enumeration answers every µ.
-`Rows` keeps one probability per row of link probabilities instead, and `Bursty` one for every row and every way in which
-the links can be good and bad.
+`Rows` keeps one probability per row of link probabilities instead, and `Bursty` one for every row and every way in
+which the links can be good and bad.
 """
 
 from __future__ import annotations
@@ -330,8 +330,8 @@ def bursty(drawn: Sequence[Event], rows: int) -> Bursty:
     """
     if rows << len(drawn) > MOST_HIDDEN:
         raise UsageError(
-            f"{len(drawn)} bursty links are good and bad in 2^{len(drawn)} ways, for {rows} rows too many to go through "
-            f"(at most {MOST_HIDDEN}): use --method optimal or --method monte-carlo"
+            f"{len(drawn)} bursty links are good and bad in 2^{len(drawn)} ways, for {rows} rows too many to go "
+            f"through (at most {MOST_HIDDEN}): use --method optimal or --method monte-carlo"
         )
     bursts = [event.burst for event in drawn if event.burst is not None]
     moves = np.array([[[[1 - g, g], [b, 1 - b]] for g, b, _, _ in burst] for burst in bursts])

@@ -218,38 +218,26 @@ def _enumerated(scenario: Scenario, rows: LinkRows, how: Settings, estimator: st
 
 
 def _optimal(scenario: Scenario, rows: LinkRows, errors: bool) -> dict[str, Any]:
-    from stochfuse.engines.contact_chain import expected_optimum, number_of_paths
+    from stochfuse.optimum import optimum
 
-    network = scenario.network
-    for what, wrong in (
-        ("network.delay", network.delay != (1.0,)),
-        ("unlike agents", len(scenario.sensors) > 1),
-        ("links that differ", not rows.uniform),
-    ):
-        if wrong:
-            raise UsageError(f"method 'optimal' does not take {what} yet; use general or monte-carlo")
-    chain = expected_optimum(
-        scenario.model,
-        scenario.sensors[0],
-        scenario.P0,
-        shared=scenario.correlation == "shared",
-        architecture=network.architecture,
-        agents=network.agents,
-        steps=network.steps,
-        link=rows.at_step,
-    )
-    bound = float(chain.bound.max())
+    found, groups = optimum(scenario, rows)
+    bound = float(found.bound.max())
     notes = [f"the optimum is proved to lie within a relative {bound:.0e} of the value shown"] if bound else []
+    moments = Moments(found.P)
+    if errors:
+        if found.bias is None:
+            raise UsageError(
+                "the optimum is only enclosed in bounds: expected quantity optimal, or fewer agents or steps"
+            )
+        # what the optimum claims is what it achieves
+        moments = Moments(found.P, found.P, found.bias, found.square)
     return {
         "nature": "bound" if bound else "exact",
-        "moments": Moments(chain.P[:, :, None]),
-        "group_of": np.zeros(network.agents, dtype=int),
+        "moments": moments,
+        "group_of": _group_of(groups),
         "estimator": "optimal",
         "notes": tuple(notes),
-        "meta": {
-            "paths": number_of_paths(network.architecture, network.agents, network.steps),
-            "relative_bound": chain.bound.tolist(),
-        },
+        "meta": {"paths": found.paths, "relative_bound": found.bound.tolist()},
     }
 
 

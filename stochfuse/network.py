@@ -4,9 +4,10 @@ Architectures (thesis 3.1): *ad-hoc* draws every ordered pair of agents, *broadc
 everyone hears it, *cyclic* lets agent j hear agent j+1 only.  A matrix of link probabilities has the receiver in
 its row and the sender in its column, µ_ij of (44); its diagonal is ignored.
 
-Bursty links follow the two-state model of Gilbert and Elliott: every link is good or bad on its own, goes from good to bad
-with probability g and from bad to good with probability b in each step, and delivers with a probability of each state.
-It starts from its stationary distribution, (b, g)/(g + b), and so delivers with the same mean probability at every step.
+Bursty links follow the two-state model of Gilbert and Elliott: every link is good or bad on its own, goes from good to
+bad with probability g and from bad to good with probability b in each step, and delivers with a probability of each
+state.  It starts from its stationary distribution, (b, g)/(g + b), and so delivers with the same mean probability at
+every step.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ class LinkRows:
         return self.link.ndim in (2, 4)
 
     def chain(self, µ: np.ndarray) -> np.ndarray | None:
-        """Good→bad, bad→good, delivery in good and in bad, (rows, 4), of a link whose mean probability is µ in each row.
+        """Good→bad, bad→good, delivery in good and in bad, (rows, 4), of a link of mean probability µ in each row.
 
         None if no row has a memory; a row without is one whose two states deliver alike.
         """

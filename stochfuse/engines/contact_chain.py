@@ -1,45 +1,76 @@
 """The contact chain: the exact expected optimum, in a handful of terms (theory section 6).
 
-If fusion lost nothing, agent i at step k would hold the measurements of every agent up to the last node of it in
-its pedigree.  Walk backwards from (i, k): r_t counts the agents whose step-t measurement i holds; before the exchange
-at k it is 1, and every exchange lets those join that were heard by one of them,
+If fusion lost nothing, an agent's covariance would be that of one filter with everything it holds,
 
-    ad hoc     r → r + Binomial(n − r, 1 − (1−µ)^r)
-    broadcast  r → r + Binomial(n − r, µ)
-    cyclic     r → r + Bernoulli(µ) while r < n
-
-so that r_k ≤ … ≤ r_1.  With T_t these transition probabilities at step t,
-
-    E[P_opt(k)] = Σ over paths of T_k(1 → r_k) Π_{t<k} T_t(r_{t+1} → r_t) · P(r_1, …, r_k)
+    E[P_opt(k)] = Σ over paths of T_k(start → s_k) Π_{t<k} T_t(s_{t+1} → s_t) · P(r_1, …, r_k)
     P(r_1) = P(k0)/r_1      P(r_1 … r_t) = update(TU(P(r_1 … r_{t−1})), R/r_t)
 
-P runs forwards and does not know where the path will end: paths r_1 ≥ r_2 ≥ … are grown step by step with the weight
-Π T_t(r_{t+1} → r_t) of their backward transitions, and every step t closes with T_t(1 → r_t).  There are C(n+k−1, k)
-of them (fewer on a ring).
+where r_t counts the agents whose step-t measurement is held in state s_t of the chain (`stochfuse.engines.contacts`;
+with unlike agents one count for each kind).  The chain runs backwards and the filter forwards.  So the chain is
+reversed: paths r_1, r_2 … are grown step by step, each with its weight, the vector
 
-Where they are too many, a scalar model is carried as a distribution of P on a grid for every r.  Time update and
-measurement update are monotone and concave in P, and so are they after one another.  Putting the mass of a grid cell
-at its mean can therefore only raise the expectation, and splitting it between the cell's ends, mean kept, can only
-lower it: carried side by side, the two enclose it.  (Rounding, some 1e-13, comes on top.)
+    W(s_t) = Σ over s_1 … s_{t−1} with those counts of Π_{τ<t} T_τ(s_{τ+1} → s_τ),
+
+and every step t closes with T_t(start → s_t).  For like agents and equal links there are C(n+k−1, k) paths (fewer on a
+ring), and W is one number.  The bias follows the same paths: b(r_1 … r_t) = (I − KH) F b(r_1 … r_{t−1}).
+
+Where paths are too many, `stochfuse.engines.enclosure` gives bounds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from math import comb
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from stochfuse.engines.contacts import Contacts
 from stochfuse.errors import UsageError
 from stochfuse.kalman import Estimate, predict, update
 from stochfuse.model import Model, Sensor, at_step
 
 MOST_PATHS = 20_000
 """Paths up to which they are gone through one by one."""
-GRID = 1500
-"""Grid cells over the range of P; the enclosure's width falls with their square."""
-ROUNDING = 1e-13
+MOST_NUMBERS = 20_000_000
+"""Transition probabilities, or weights of paths, that are held at a time."""
+
+
+class Filter(NamedTuple):
+    """What an agent that loses nothing would compute.
+
+    Parameters
+    ----------
+    model : state transition and process noise.
+    sensors : sensor of each kind of agent.
+    P0 : covariance of one initial estimate.
+    shared : whether all agents start from one common estimate.
+    error : (d, 1) initial error that all agents share, or None.
+    """
+
+    model: Model
+    sensors: Sequence[Sensor]
+    P0: np.ndarray
+    shared: bool
+    error: np.ndarray | None = None
+
+    def start(self, counts: np.ndarray) -> Estimate:
+        """Estimate from so many agents' initial ones, and what it leaves of the error."""
+        x = np.zeros((len(self.P0), 1)) if self.error is None else self.error
+        return Estimate(x[None], (self.P0 if self.shared else self.P0 / counts.sum())[None])
+
+    def after(self, estimate: Estimate, counts: np.ndarray, step: int) -> Estimate:
+        """Predict to a step and take in the measurements of so many agents of each kind; of errors, if there are.
+
+        Of one kind, the numbers may be a stack (..., 1) that goes with the estimate's.
+        """
+        model = self.model
+        estimate = predict(estimate, at_step(model.F, step), at_step(model.Q, step))
+        for sensor, count in zip(self.sensors, np.moveaxis(counts, -1, 0), strict=True):
+            if count.any():
+                H, R = at_step(sensor.H, step), at_step(sensor.R, step)
+                z = None if estimate.x is None else np.zeros((len(H), 1))
+                estimate = update(estimate, H, R / count[..., None, None], z)
+        return estimate
 
 
 class Chain(NamedTuple):
@@ -47,148 +78,139 @@ class Chain(NamedTuple):
 
     Parameters
     ----------
-    P : (rows, steps, d, d) expectation, or the middle of what encloses it.
+    P : (rows, steps, groups, d, d) expectation, or the middle of what encloses it.
+    bias : (rows, steps, groups, d, 1), or None where it is not known.
+    square : (rows, steps, groups, d, d) E[P + b bᵀ], or None.
     bound : (rows, steps) relative half-width of the enclosure; 0 where every path was gone through.
+    paths : number of paths gone through, or None.
     """
 
     P: np.ndarray
+    bias: np.ndarray | None
+    square: np.ndarray | None
     bound: np.ndarray
+    paths: int | None
 
 
-def transitions(architecture: str, n: int, µ: np.ndarray) -> np.ndarray:
-    """T(r → r′) for r, r′ = 1 … n, shape (rows, n, n)."""
-    T = np.zeros((len(µ), n, n))
-    for r in range(1, n + 1):
-        if architecture == "cyclic":
-            T[:, r - 1, r - 1] = 1.0 if r == n else 1.0 - µ
-            if r < n:
-                T[:, r - 1, r] = µ
-            continue
-        joins = 1.0 - (1.0 - µ) ** r if architecture == "ad-hoc" else µ
-        for more in range(n - r + 1):
-            T[:, r - 1, r - 1 + more] = comb(n - r, more) * joins**more * (1.0 - joins) ** (n - r - more)
-    return T
+class TooManyPathsError(UsageError):
+    """More paths than can be gone through one by one."""
 
 
-def number_of_paths(architecture: str, n: int, k: int) -> int:
-    """How many paths r_1 ≥ … ≥ r_k there are: C(n+k−1, k), on a ring those that fall by at most 1 and end at 1 or 2."""
-    if architecture != "cyclic":
-        return comb(n + k - 1, k)
-    if n == 1:
-        return 1
-    # in some of k exchanges one agent joins; the last of n joins at some exchange t, and nothing happens after it
-    fewer = sum(comb(k, joins) for joins in range(min(n - 1, k + 1)))
-    return fewer + sum(comb(t - 1, n - 2) for t in range(n - 1, k + 1))
+class Class(NamedTuple):
+    """Paths that end with the same counts: estimate after each, and weight (rows, states of those counts, paths)."""
+
+    estimate: Estimate
+    weight: np.ndarray
 
 
-def expected_optimum(
-    model: Model,
-    sensor: Sensor,
-    P0: np.ndarray,
-    *,
-    shared: bool,
-    architecture: str,
-    agents: int,
-    steps: int,
-    link: Callable[[int], np.ndarray],
-) -> Chain:
-    """Expected optimum for like agents.
+def by_counts(contacts: Contacts) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Different counts (classes, kinds), and the states of each."""
+    counts, class_of = np.unique(contacts.held, axis=0, return_inverse=True)
+    return counts, [np.flatnonzero(class_of.ravel() == c) for c in range(len(counts))]
+
+
+def blocks_of_rows(contacts: Contacts, rows: int) -> Iterator[slice]:
+    """Rows in blocks whose transition probabilities fit in memory."""
+    size = max(1, MOST_NUMBERS // len(contacts.held) ** 2)
+    return (slice(first, min(first + size, rows)) for first in range(0, rows, size))
+
+
+def transitions(contacts: Contacts, steps: int, some: slice) -> Iterator[np.ndarray]:
+    """T of every step in turn."""
+    T = contacts.transition(1, some)
+    for step in range(1, steps + 1):
+        yield T
+        if step < steps and not contacts.constant:
+            T = contacts.transition(step + 1, some)
+
+
+def expected_optimum(given: Filter, contacts: Contacts, steps: int, rows: int) -> Chain:
+    """Go through every path.
 
     Parameters
     ----------
-    link : µ of every row at a step, (rows,).
+    steps, rows : numbers of steps, and of rows of link probabilities.
 
     Raises
     ------
-    UsageError
-        If there are too many paths and the state has several dimensions.
+    TooManyPathsError
+        If there are more than `MOST_PATHS`.
     """
-    T = [transitions(architecture, agents, link(step)) for step in range(1, steps + 1)]
-    if comb(agents + steps - 1, steps) <= MOST_PATHS:
-        P = _paths(model, sensor, P0, T, shared=shared)
-        return Chain(P, np.zeros(P.shape[:2]))
-    if model.dimension > 1:
-        raise UsageError(
-            f"the optimum of {agents} agents after {steps} steps has {comb(agents + steps - 1, steps):.3g} paths, "
-            f"at most {MOST_PATHS} are gone through for a state of several dimensions: use fewer steps or agents, or "
-            "--method monte-carlo"
+    found = [_paths(given, contacts, steps, some) for some in blocks_of_rows(contacts, rows)]
+    P, b, M = (np.concatenate([moments[m] for moments, _ in found]) for m in range(3))
+    return Chain(P, b, M, np.zeros(P.shape[:2]), found[0][1])
+
+
+def _paths(given: Filter, contacts: Contacts, steps: int, some: slice) -> tuple[list[np.ndarray], int]:
+    counts, states = by_counts(contacts)
+    classes: dict[int, Class] = {}
+    out: list[list[np.ndarray]] = [[], [], []]
+    paths, before = 0, np.empty(0)
+    for step, T in enumerate(transitions(contacts, steps, some), start=1):
+        if step == 1:
+            ones = {c: np.ones((len(T), len(states[c]), 1)) for c in range(len(counts))}
+            classes = {c: Class(given.start(counts[c]), weight) for c, weight in ones.items()}
+        else:
+            classes = _grown(given, classes, before, counts, states, step)
+        paths = sum(c.weight.shape[2] for c in classes.values())
+        for place, moment in enumerate(_closed(classes, T, states, contacts.starts)):
+            out[place].append(moment)
+        before = T
+    return [np.stack(moment, axis=1) for moment in out], paths
+
+
+def _closed(
+    classes: dict[int, Class], T: np.ndarray, states: list[np.ndarray], starts: Sequence[int]
+) -> tuple[Any, Any, Any]:
+    """E[P], E[b] and E[P + b bᵀ] over the paths, each (rows, groups, …)."""
+    P, b, M = 0.0, 0.0, 0.0
+    for c, (estimate, weight) in classes.items():
+        last = T[:, list(starts)][:, :, states[c]] @ weight  # (rows, groups, paths)
+        square = estimate.P + estimate.x @ np.swapaxes(estimate.x, -1, -2)
+        x = np.broadcast_to(estimate.x, (*estimate.P.shape[:-1], 1))
+        P, b, M = P + _over(last, estimate.P), b + _over(last, x), M + _over(last, square)
+    return P, b, M
+
+
+def _over(weight: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return np.tensordot(weight, values, axes=1)
+
+
+def _grown(
+    given: Filter,
+    classes: dict[int, Class],
+    T: np.ndarray,
+    counts: np.ndarray,
+    states: list[np.ndarray],
+    step: int,
+) -> dict[int, Class]:
+    """Every path with every count that may follow."""
+    grown, paths = {}, 0
+    for c, here in enumerate(states):
+        parents, weights = [], []
+        rows_here = T[:, here]
+        for before, (estimate, weight) in classes.items():
+            block = rows_here[:, :, states[before]]
+            if not block.any():
+                continue
+            new = block @ weight
+            alive = np.flatnonzero(new.any(axis=(0, 1)))
+            if len(alive):
+                x = np.broadcast_to(estimate.x, (*estimate.P.shape[:-1], 1))
+                parents.append(Estimate(x[alive], estimate.P[alive]))
+                weights.append(new[:, :, alive])
+        if parents:
+            together = Estimate(*map(np.concatenate, zip(*parents, strict=True)))
+            grown[c] = Class(given.after(together, counts[c], step), np.concatenate(weights, axis=2))
+            paths += len(together.P)
+            check_size(paths, sum(g.weight.size for g in grown.values()))
+    return grown
+
+
+def check_size(paths: float, numbers: float = 0.0) -> None:
+    """Raise TooManyPathsError beyond `MOST_PATHS` paths or `MOST_NUMBERS` weights."""
+    if paths > MOST_PATHS or numbers > MOST_NUMBERS:
+        raise TooManyPathsError(
+            f"the contact chain has {paths:.3g} paths or more, at most {MOST_PATHS} are gone through one by one: use "
+            "fewer steps or agents, or --method monte-carlo with --estimator optimal"
         )
-    rows = [_enclosed(model, sensor, P0, [t[row] for t in T], shared=shared) for row in range(len(T[0]))]
-    low, high = np.array(rows).transpose(1, 0, 2)
-    return Chain(0.5 * (low + high)[..., None, None], 0.5 * (high - low) / low + ROUNDING)
-
-
-def _paths(model: Model, sensor: Sensor, P0: np.ndarray, T: list[np.ndarray], *, shared: bool) -> np.ndarray:
-    n = T[0].shape[1]
-    last = np.arange(1, n + 1)
-    P = np.stack([P0 if shared else P0 / r for r in last])
-    weight = np.ones((len(T[0]), n))
-    out = []
-    for step, now in enumerate(T, start=1):
-        if step > 1:
-            # every path r_1 … r_{t−1} goes on to r_t = 1 … r_{t−1}
-            parent = np.repeat(np.arange(len(last)), last)
-            following = np.arange(len(parent)) - np.repeat(np.cumsum(last) - last, last) + 1
-            weight = weight[:, parent] * T[step - 2][:, following - 1, last[parent] - 1]
-            prior = predict(Estimate(None, P), at_step(model.F, step), at_step(model.Q, step)).P[parent]
-            R = at_step(sensor.R, step) / following[:, None, None]
-            P, last = update(Estimate(None, prior), at_step(sensor.H, step), R).P, following
-        out.append(np.tensordot(weight * now[:, 0, last - 1], P, axes=1))
-    return np.stack(out, axis=1)
-
-
-def _enclosed(
-    model: Model, sensor: Sensor, P0: np.ndarray, T: list[np.ndarray], *, shared: bool
-) -> tuple[list[float], list[float]]:
-    """Lower and upper bounds of the expectation at every step, one row, scalar model."""
-    n, p0 = len(T[0]), P0.item()
-    r = np.arange(1, n + 1)
-
-    def after(P: np.ndarray | float, step: int) -> np.ndarray:
-        """P(t) for every r_t, shape (n, any), from P(t−1), the same for all r_t or one row for each."""
-        F, Q = at_step(model.F, step).item(), at_step(model.Q, step).item()
-        H, R = at_step(sensor.H, step), at_step(sensor.R, step)
-        J = (H.T @ np.linalg.solve(R, H)).item()
-        prior = F * F * P + Q
-        return prior / (1.0 + r[:, None] * J * prior)
-
-    start = np.full(n, p0) if shared else p0 / r
-    least, most = start.min(), start.max()
-    extremes = [least, most]
-    for step in range(2, len(T) + 1):
-        least, most = after(least, step)[-1, 0], after(most, step)[0, 0]
-        extremes += [least, most]
-    # 0 below all: what is moved down from anywhere can only lower the expectation
-    nodes = np.concatenate([[0.0], np.geomspace(min(extremes) * 0.98, max(extremes) * 1.02, GRID - 1)])
-    low = np.stack([_split(nodes, start[i : i + 1], np.ones(1)) for i in range(n)])  # mass at the nodes
-    mass, moment = np.zeros((2, n, GRID))  # mass and mass·P of the cells
-    cells = _cells(nodes, start)
-    mass[r - 1, cells], moment[r - 1, cells] = 1.0, start
-    lower, upper = [], []
-    for step, now in enumerate(T, start=1):
-        if step > 1:
-            before = T[step - 2]
-            low, mass, moment = before @ low, before @ mass, before @ moment
-            mean = np.divide(moment, mass, out=np.broadcast_to(nodes, mass.shape).copy(), where=mass > 0)
-            at_nodes, at_means = after(nodes, step), after(mean, step)
-            low = np.stack([_split(nodes, P, m) for P, m in zip(at_nodes, low, strict=True)])
-            cells = (_cells(nodes, at_means) + GRID * (r[:, None] - 1)).ravel()
-            mass, moment = (
-                np.bincount(cells, weights.ravel(), minlength=n * GRID).reshape(n, GRID)
-                for weights in (mass, mass * at_means)
-            )
-        lower.append(float(now[0] @ (low @ nodes)))
-        upper.append(float(now[0] @ moment.sum(axis=1)))
-    return lower, upper
-
-
-def _cells(nodes: np.ndarray, P: np.ndarray) -> np.ndarray:
-    return np.clip(np.searchsorted(nodes, P, side="right") - 1, 0, len(nodes) - 1)
-
-
-def _split(nodes: np.ndarray, P: np.ndarray, mass: np.ndarray) -> np.ndarray:
-    """Mass at values P put on the two nodes around each, the mean kept (beyond the last one, on that)."""
-    left = np.minimum(_cells(nodes, P), len(nodes) - 2)
-    share = np.clip((P - nodes[left]) / (nodes[left + 1] - nodes[left]), 0.0, 1.0)
-    found = np.bincount(left, mass * (1.0 - share), minlength=len(nodes))
-    return found + np.bincount(left + 1, mass * share, minlength=len(nodes))
