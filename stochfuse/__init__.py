@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from stochfuse.states import predict_states as predict_states
     from stochfuse.symbolic import derive_simplified as derive_simplified
     from stochfuse.symbolic_general import derive_general as derive_general
+    from stochfuse.symbolic_optimal import derive_optimal as derive_optimal
 
 _HOME = {
     "Comparison": "comparison",
@@ -48,6 +49,7 @@ _HOME = {
     "compare": "comparison",
     "check_results": "crosscheck",
     "derive_general": "symbolic_general",
+    "derive_optimal": "symbolic_optimal",
     "derive_simplified": "symbolic",
     "load_history": "fusion_graph",
     "load_scenario": "scenario",
@@ -70,6 +72,7 @@ __all__ = [
     "check_results",
     "compare",
     "derive_general",
+    "derive_optimal",
     "derive_simplified",
     "load_history",
     "load_scenario",

@@ -137,3 +137,27 @@ def test_forms_that_would_fill_books_are_refused():
         sf.UsageError, match="step 3 of 5 agents has too many outcomes for an exact form: give fewer agents"
     ):
         derive_general(5, 3, 25, 100, 100).closed()
+
+
+@pytest.mark.parametrize("architecture", ["ad-hoc", "broadcast", "cyclic"])
+@pytest.mark.parametrize("correlation", ["independent", "shared"])
+def test_the_optimum_as_a_polynomial(architecture, correlation):
+    """The contact chain's paths against the enumeration of the optimum, A_c by A_c, in rational numbers."""
+    steps = 2 if architecture == "ad-hoc" else 3
+    given = {"architecture": architecture, "correlation": correlation}
+    chain = sf.derive_optimal(3, steps, "7/3", "5", "11/2", **given)
+    assert chain.bernstein == derive_general(3, steps, "7/3", "5", "11/2", estimator="optimal", **given).bernstein
+
+
+def test_the_optimum_with_symbols():
+    form = sf.derive_optimal(3, 3)
+    value = form.lambdify()(np.array([0.3, 0.8]), 25.0, 100.0, 100.0)
+    np.testing.assert_allclose(value, sf.predict(sf.load_scenario(), [0.3, 0.8], "optimal").values()[:, 2], rtol=1e-12)
+    assert len(sf.derive_optimal(3, 5, 25, 100, 100).terms) == 21
+    made = derivation.derivation(form)
+    assert "expected optimal posterior covariance P_k after step k (exact: every path" in made.title
+    assert made.facts["quantity"] == "optimal"
+    with pytest.raises(sf.UsageError, match="450 links make polynomials of degree 450, at most 400 are worked out"):
+        sf.derive_optimal(10, 5, 1, 1, 1).polynomial()
+    with pytest.raises(sf.UsageError, match="paths or more, at most 20000"):
+        sf.derive_optimal(30, 9, 1, 1, 1).polynomial()

@@ -180,20 +180,21 @@ class FusionNetwork:
     """One history of a network, step by step, with the Local Fusion Graph or naively.
 
     sensors: (H, R) per agent; records: z[step][agent] columns; history: per step a set of (sender, receiver, sent step).
+    x0: one for all, or a list of each agent's own.
     """
 
     def __init__(self, F, Q, sensors, P0, x0, records, history, shared=False, naive=False):
         self.F, self.Q, self.sensors, self.records = F, Q, sensors, records
         n = len(sensors)
         Y0 = np.linalg.inv(P0)
-        root = (Y0 @ x0, Y0)
-        self.locals = {"root": root}
+        starts = [(Y0 @ x, Y0) for x in (x0 if isinstance(x0, list) else [x0] * n)]
+        self.locals = {"root": starts[0]}
         self.fused = {}
         parents = {(i, 1): ({"root"} if shared else set()) for i in range(n)}
         graph = FusionGraph(parents, lambda node: self.locals[node], self.forward)
         for k, messages in enumerate(history, start=1):
             for i in range(n):
-                self.locals[i, k] = root if k == 1 else self.measure(self.forward(self.fused[i, k - 1], k), i, k)
+                self.locals[i, k] = starts[i] if k == 1 else self.measure(self.forward(self.fused[i, k - 1], k), i, k)
             for i in range(n):
                 received = {(i, k)} | {(j, sent) for j, receiver, sent in messages if receiver == i}
                 if naive:
@@ -242,6 +243,59 @@ def histories(n, steps, architecture, link, delay=(1.0,)):
                 history[k + fate - 1] |= {(j, i, k) for i in receivers}
         if probability > 0:
             yield probability, history
+
+
+def impulses(F, Q, sensors, P0, error, steps, shared):
+    """Worlds in which one noise strikes once, with its standard deviation, and one where only the first error is wrong.
+
+    Returns every agent's first estimate, the truth and the measurements, a column for each world: simulated, not derived.
+    """
+    n, d = len(sensors), len(P0)
+    worlds = []  # (first errors per agent, process noise per step, measurement noise per step and agent)
+
+    def world(start=None, process=None, measurement=None):
+        worlds.append((start or {}, process or {}, measurement or {}))
+
+    for i in [0] if shared else range(n):
+        for column in np.linalg.cholesky(P0).T:
+            world(start=dict.fromkeys(range(n), column) if shared else {i: column})
+    eigenvalues, vectors = np.linalg.eigh(Q)
+    for k in range(2, steps + 1):
+        for value, vector in zip(eigenvalues, vectors.T, strict=True):
+            world(process={k: np.sqrt(max(value, 0)) * vector})
+        for i, (_, R) in enumerate(sensors):
+            for column in np.linalg.cholesky(R).T:
+                world(measurement={(k, i): column})
+    world(start=dict.fromkeys(range(n), error))
+    first = [np.column_stack([w[0].get(i, np.zeros(d)) for w in worlds]) for i in range(n)]
+    truth, records = [np.zeros((d, len(worlds)))], []
+    for k in range(1, steps + 1):
+        if k > 1:
+            truth.append(F @ truth[-1] + np.column_stack([w[1].get(k, np.zeros(d)) for w in worlds]))
+        records.append([
+            H @ truth[-1] + np.column_stack([w[2].get((k, i), np.zeros(len(R))) for w in worlds])
+            for i, (H, R) in enumerate(sensors)
+        ])  # fmt: skip
+    return first, truth, records
+
+
+def error_moments_by_enumeration(
+    F, Q, sensors, P0, error, steps, architecture, link, delay=(1.0,), shared=False, naive=False
+):
+    """Expected actual covariance, bias and mean squared error, [step][agent], over every history, nothing merged."""
+    n = len(sensors)
+    first, truth, records = impulses(F, Q, sensors, P0, error, steps, shared)
+    A, b, M = np.zeros((steps, n, *P0.shape)), np.zeros((steps, n, len(P0), 1)), np.zeros((steps, n, *P0.shape))
+    for probability, history in histories(n, steps, architecture, link, delay):
+        network = FusionNetwork(F, Q, sensors, P0, first, records, history, shared, naive)
+        for k in range(1, steps + 1):
+            for i in range(n):
+                wrong = network.state(i, k) - truth[k - 1]
+                noise, bias = wrong[:, :-1], wrong[:, -1:]
+                A[k - 1, i] += probability * noise @ noise.T
+                b[k - 1, i] += probability * bias
+                M[k - 1, i] += probability * (noise @ noise.T + bias @ bias.T)
+    return A, b, M
 
 
 def expected_by_enumeration(

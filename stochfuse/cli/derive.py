@@ -16,6 +16,7 @@ class Formulation(StrEnum):
     simplified = "simplified"
     general = "general"
     naive = "naive"
+    optimal = "optimal"
 
 
 class FormulaFormat(StrEnum):
@@ -44,7 +45,7 @@ def derive(
     r: Annotated[str | None, _Number] = None,
     p0: Annotated[str | None, _Number] = None,
     architecture: Annotated[
-        Architecture, typer.Option(help="general, naive: who may hear whom.")
+        Architecture, typer.Option(help="general, naive, optimal: who may hear whom.")
     ] = Architecture.ad_hoc,
     correlation: Annotated[Correlation, typer.Option(help="Initial estimates.")] = Correlation.independent,
     latex: Annotated[bool, typer.Option("--latex", help="The same as --format latex.")] = False,
@@ -58,8 +59,8 @@ def derive(
 
     For like agents with a scalar state, F = G = H = 1. simplified: chain, rational function of µ, derivative, series at
     µ = 0 and 1, fixed point. general: a polynomial in µ (a sum over every covariance that can be claimed), derivative,
-    and coefficients by number of arrivals; naive: the same for naive fusion. Forms too large to expand stay small with
-    numbers for q, r and p0.
+    and coefficients by number of arrivals; naive: the same for naive fusion; optimal: for the best that linear fusion
+    can do. Forms too large to expand stay small with numbers for q, r and p0.
     """
     import sys
 
@@ -76,6 +77,10 @@ def derive(
         if architecture is Architecture.cyclic:
             raise UsageError("--architecture cyclic: expected formulation general, got simplified")
         form = derive_simplified(agents, step, q, r, p0, correlation=correlation.value)
+    elif formulation is Formulation.optimal:
+        from stochfuse.symbolic_optimal import derive_optimal
+
+        form = derive_optimal(agents, step, q, r, p0, architecture=architecture.value, correlation=correlation.value)
     else:
         from stochfuse.symbolic_general import derive_general
 

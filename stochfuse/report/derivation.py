@@ -42,10 +42,10 @@ class Derivation(NamedTuple):
 
 def derivation(form: SimplifiedForm | GeneralForm) -> Derivation:
     """Return the formulas of a form that fit on pages."""
-    method = "general" if isinstance(form, GeneralForm) else "simplified"
+    method = _METHODS[form.estimator] if isinstance(form, GeneralForm) else "simplified"
     facts = {
-        "method": method if not isinstance(form, GeneralForm) or form.estimator != "naive" else "naive",
-        "quantity": "claimed",
+        "method": method,
+        "quantity": "optimal" if method == "optimal" else "claimed",
         "agents": form.agents,
         "step": form.step,
         "symbols": ["mu", *map(str, form.symbols)],
@@ -60,6 +60,7 @@ def _agents(n: int) -> str:
     return "1 agent" if n == 1 else f"{n} like agents"
 
 
+_METHODS = {"local-fusion-graph": "general", "naive": "naive", "optimal": "optimal"}
 _SYMBOLS = "mu: link probability, q, r: process and measurement noise variance, p0: variance of the initial estimates"
 
 
@@ -74,12 +75,13 @@ def _simplified_title(form: SimplifiedForm) -> str:
 
 def _general_title(form: GeneralForm) -> str:
     start = "shared" if form.shared else "independent"
-    what = "naive fusion (42)/(43)" if form.estimator == "naive" else "the Local Fusion Graph"
+    rule = "naive fusion (42)/(43)" if form.estimator == "naive" else "the Local Fusion Graph"
+    what, quantity, exact = f"General formulation (49) of {rule}", "claimed", "every outcome"
+    if form.estimator == "optimal":
+        what, quantity, exact = "Contact chain", "optimal", "every path; the best that linear fusion can do"
     return (
-        f"General formulation (49) of {what}, {_agents(form.agents)}, {form.architecture}, scalar state with "
-        f"F = G = H = "
-        f"1, {start} initial estimates: expected claimed posterior covariance P_k after step k (exact: every outcome). "
-        f"{_SYMBOLS}"
+        f"{what}, {_agents(form.agents)}, {form.architecture}, scalar state with F = G = H = 1, {start} initial "
+        f"estimates: expected {quantity} posterior covariance P_k after step k (exact: {exact}). {_SYMBOLS}"
     )
 
 
@@ -88,7 +90,8 @@ def _general_formulas(form: GeneralForm) -> list[Formula]:
     P_k, derivative = sympy.Symbol(f"P_{k}"), sympy.Symbol(f"dP_{k}_dmu")
     says = f"P_{k} as a polynomial in mu"
     if form.symbols:
-        says = f"P_{k}: every covariance that can be claimed, times the probability that it is, a polynomial in mu"
+        reached = "reached" if form.estimator == "optimal" else "claimed"
+        says = f"P_{k}: every covariance that can be {reached}, times the probability that it is, a polynomial in mu"
     lines = [
         Formula("closed", says, P_k, form.closed()),
         Formula("derivative", f"derivative of P_{k} in mu", derivative, form.derivative()),
