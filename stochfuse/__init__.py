@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from stochfuse.errors import UsageError as UsageError
     from stochfuse.fusion_graph import FusionGraph as FusionGraph
     from stochfuse.fusion_graph import load_history as load_history
+    from stochfuse.messages import MessageLoad as MessageLoad
+    from stochfuse.messages import message_load as message_load
     from stochfuse.methods import predict as predict
     from stochfuse.prediction import Prediction as Prediction
     from stochfuse.questions import steady_state as steady_state
@@ -40,6 +42,7 @@ if TYPE_CHECKING:
 _HOME = {
     "Comparison": "comparison",
     "FusionGraph": "fusion_graph",
+    "MessageLoad": "messages",
     "NoAnswerError": "errors",
     "Prediction": "prediction",
     "Scenario": "scenario",
@@ -53,6 +56,7 @@ _HOME = {
     "derive_simplified": "symbolic",
     "load_history": "fusion_graph",
     "load_scenario": "scenario",
+    "message_load": "messages",
     "predict": "methods",
     "predict_states": "states",
     "read_results": "results",
@@ -62,6 +66,7 @@ _HOME = {
 __all__ = [
     "Comparison",
     "FusionGraph",
+    "MessageLoad",
     "NoAnswerError",
     "Prediction",
     "Scenario",
@@ -76,6 +81,7 @@ __all__ = [
     "derive_simplified",
     "load_history",
     "load_scenario",
+    "message_load",
     "predict",
     "predict_states",
     "read_results",

@@ -1,0 +1,399 @@
+"""Message load as table, CSV, JSON and figure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from textwrap import wrap
+from typing import Any
+
+import numpy as np
+
+from stochfuse import __version__
+from stochfuse.messages import IDENTITY_BYTES, NUMBER_BYTES, Accuracy, Bytes, MessageLoad, Moments, Row, in_bytes
+from stochfuse.metrics import Metric
+from stochfuse.report.export import write_file
+from stochfuse.report.plot import MARKERS, figure_class, spread
+from stochfuse.report.predictions import View
+from stochfuse.report.table import Table, number, to_csv
+
+SCHEMA = "stochfuse.messages/1"
+SHORT = {"local-fusion-graph": "LFG", "naive": "naive"}
+RULE_TITLES = {
+    "local-fusion-graph": "Local Fusion Graph, all that is new to the receiver",
+    "naive": "naive fusion, the sender's latest node",
+}
+KINDS = ("moments", "distribution", "cdf", "accuracy")
+MOST_INSIDE = 6
+"""Curves up to which the legend stands inside the axes."""
+_SIZES = ("nodes", "probability", "cumulative")
+HEADINGS = {
+    "moments": ("mean", "std", "max", "standard_error", "mean_bytes", "max_bytes"),
+    "distribution": _SIZES,
+    "cdf": _SIZES,
+    "accuracy": (
+        "mean", "mean_bytes", "metric", "unit", "quantity", "method", "accuracy_nature", "accuracy",
+        "accuracy_standard_error_at_most",
+    ),
+}  # fmt: skip
+"""What CSV has beside the columns that every kind has."""
+
+
+@dataclass(frozen=True)
+class LoadView:
+    """What of message loads is shown.
+
+    Parameters
+    ----------
+    loads : one per rule, of one window.
+    messages : the naive load of that window: the number of messages.
+    kind : one of `KINDS`.
+    agent : "mean" (an agent picked at random) or a number from 1.
+    header : bytes per message where loads are shown in bytes too, else None.
+    accuracies : one per load, for kind "accuracy".
+    metric : what is shown of the covariance, for kind "accuracy".
+    digits : significant digits in tables.
+    """
+
+    loads: tuple[MessageLoad, ...]
+    messages: MessageLoad
+    kind: str = "moments"
+    agent: int | str = "mean"
+    header: int | None = None
+    accuracies: tuple[Accuracy, ...] = ()
+    metric: Metric | None = None
+    digits: int = 5
+
+    def bytes_of(self, load: MessageLoad) -> Bytes:
+        """Return a load in bytes."""
+        return in_bytes(load, self.messages, header=self.header or 0, agent=self.agent)
+
+    @property
+    def window(self) -> str:
+        """The steps, in words."""
+        first, last = self.loads[0].steps[[0, -1]]
+        return f"step {first}" if first == last else f"steps {first} to {last}"
+
+    @property
+    def whom(self) -> str:
+        """One line: the scenario, whose load and which steps."""
+        scenario, one = self.loads[0].scenario, self.loads[0].probabilities.shape[2] == 1
+        n = scenario.network.agents
+        whose = (
+            "alone"
+            if n == 1
+            else "every agent alike"
+            if one
+            else "an agent picked at random"
+            if self.agent == "mean"
+            else ""
+        )
+        whose = whose or f"agent {self.agent}"
+        agents = f"{n} agent{'s' * (n > 1)}, {scenario.network.architecture}"
+        return f"{scenario.name}: {agents}; {whose}; {self.window}"
+
+    @property
+    def what(self) -> str:
+        """One line: what is counted."""
+        counted = "nodes new to an agent in all messages of a step, each counted once"
+        start = {
+            "moments": "Message load: ",
+            "distribution": "Message load, probability of each number of ",
+            "cdf": "Message load, probability of at most so many ",
+            "accuracy": "Accuracy against message load, which is the mean number of ",
+        }
+        return start[self.kind] + counted
+
+    @property
+    def titles(self) -> tuple[str, ...]:
+        """Lines that say what is shown and how exact it is."""
+        lines = [self.what, self.whom, *(f"{SHORT[load.rule]}: {self.how(load)}" for load in self.loads)]
+        lines += [f"accuracy of {SHORT[a.load.rule]}: {self.accuracy_view(a).how}" for a in self.accuracies]
+        if self.accuracies:
+            bounded = "; ± at most one standard error of the average" if self.accuracies[0].error is not None else ""
+            lines.append(self.accuracy_view(self.accuracies[0]).what + f", averaged over {self.window}{bounded}")
+        if self.header is not None:
+            d = self.loads[0].scenario.model.dimension
+            pair = f"an information pair of {d} + {d * (d + 1) // 2} numbers of {NUMBER_BYTES}"
+            node = self.bytes_of(self.loads[0]).node
+            lines.append(
+                f"B: bytes; {node} a node ({pair}, and {IDENTITY_BYTES} to identify it), {self.header} a message"
+            )
+        return tuple(lines)
+
+    def how(self, load: MessageLoad) -> str:
+        """What a rule sends and how exact its load is."""
+        if load.sample is None:
+            return f"{RULE_TITLES[load.rule]}; exact"
+        runs = f"{load.sample.shape[1]:,} runs, seed {load.seed}"
+        return f"{RULE_TITLES[load.rule]}; sampled, {runs}; ± one standard error"
+
+    def accuracy_view(self, accuracy: Accuracy) -> View:
+        """Return a view of an accuracy's prediction, for its texts."""
+        if self.metric is None:
+            raise ValueError("a view of accuracies needs a metric")
+        return View(accuracy.prediction, self.metric, self.agent)
+
+
+def load_table(view: LoadView) -> Table:
+    """Return rows of link probabilities (of rules and sizes for distributions)."""
+    if view.kind in ("distribution", "cdf"):
+        return _distribution_table(view)
+    columns, cells = [], []
+    accuracies: Sequence[Accuracy | None] = view.accuracies or (None,) * len(view.loads)
+    for load, accuracy in zip(view.loads, accuracies, strict=True):
+        short = SHORT[load.rule]
+        columns.append(f"{short} {'load' if accuracy else 'mean'}")
+        cells.append(_numbers(load.mean(view.agent), load.standard_error(view.agent), view.digits))
+        if accuracy is None:
+            columns += [f"{short} std", f"{short} max"]
+            cells += [_numbers(load.std(view.agent), None, view.digits), load.maximum(view.agent).astype(str).tolist()]
+        if view.header is not None:
+            size = view.bytes_of(load)
+            columns += [f"{short} mean B", f"{short} max B"]
+            cells += [_numbers(size.mean, None, view.digits), size.maximum.astype(str).tolist()]
+        if accuracy is not None:
+            columns.append(f"{short} accuracy")
+            cells.append(_numbers(accuracy.values, accuracy.error, view.digits))
+    first = view.loads[0]
+    keys = [(f"{µ:.6g}",) if first.cases is None else (first.cases[i], f"{µ:.4g}") for i, µ in enumerate(first.link)]
+    rows = tuple((*key, *row) for key, row in zip(keys, zip(*cells, strict=True), strict=True))
+    drawn = "drawn" if any(load.sample is not None for load in view.loads) else "possible"
+    note = f"std: over outcomes, steps and agents; max: the largest load {drawn}"
+    titles = (*view.titles, *([] if view.accuracies else [note]))
+    return Table(titles, (_mean(first),) if first.cases is None else ("links", _mean(first)), tuple(columns), rows)
+
+
+def _mean(load: MessageLoad) -> str:
+    link = load.scenario.network.link
+    return "µ" if load.cases is None and (link is None or link.ndim == 0) else "mean µ"
+
+
+def _numbers(values: np.ndarray, errors: np.ndarray | None, digits: int) -> list[str]:
+    shown = [number(value, digits) if value else "0" for value in values]
+    return shown if errors is None else [f"{v} ±{e:.2g}" for v, e in zip(shown, errors, strict=True)]
+
+
+def _names(load: MessageLoad) -> list[str]:
+    return list(load.cases or [f"{_mean(load)} = {µ:.4g}" for µ in load.link])
+
+
+def _probabilities(load: MessageLoad, view: LoadView) -> np.ndarray:
+    """Probabilities of each size, or of at most that, up to the largest one, (rows, sizes)."""
+    values = load.cdf(view.agent) if view.kind == "cdf" else load.distribution(view.agent)
+    return values[:, : load.maximum(view.agent).max() + 1]
+
+
+def _distribution_table(view: LoadView) -> Table:
+    rows = []
+    for load in view.loads:
+        values = _probabilities(load, view)
+        rows += [(SHORT[load.rule], str(size), *_numbers(v, None, view.digits)) for size, v in enumerate(values.T)]
+    return Table(view.titles, ("rule", "nodes"), tuple(_names(view.loads[0])), tuple(rows))
+
+
+def load_csv(view: LoadView) -> str:
+    """One line per rule and link probability, for distributions per size too."""
+    headings = ["rule", "nature", "agent", "case", "link", "from_step", "to_step"]
+    headings += HEADINGS[view.kind]
+    rows: list[tuple[Any, ...]] = []
+    for r, load in enumerate(view.loads):
+        first, last = map(int, load.steps[[0, -1]])
+        for i, µ in enumerate(load.link.tolist()):
+            case = "" if load.cases is None else load.cases[i]
+            start = (load.rule, load.nature, view.agent, case, µ, first, last)
+            if view.kind == "moments":
+                rows.append((*start, *_moments_cells(view, load, i)))
+            elif view.kind == "accuracy":
+                rows.append((*start, *_accuracy_cells(view, view.accuracies[r], i)))
+            else:
+                both = zip(load.distribution(view.agent)[i].tolist(), load.cdf(view.agent)[i].tolist(), strict=True)
+                rows += [(*start, size, *each) for size, each in enumerate(both)]
+    return to_csv(headings, rows)
+
+
+def _moments_cells(view: LoadView, load: MessageLoad, row: int) -> tuple[Any, ...]:
+    error, size = load.standard_error(view.agent), view.bytes_of(load)
+    return (
+        float(load.mean(view.agent)[row]),
+        float(load.std(view.agent)[row]),
+        int(load.maximum(view.agent)[row]),
+        "" if error is None else float(error[row]),
+        float(size.mean[row]),
+        int(size.maximum[row]),
+    )
+
+
+def _accuracy_cells(view: LoadView, accuracy: Accuracy, row: int) -> tuple[Any, ...]:
+    shown = view.accuracy_view(accuracy)
+    load, p = accuracy.load, accuracy.prediction
+    return (
+        float(load.mean(view.agent)[row]),
+        float(view.bytes_of(load).mean[row]),
+        shown.metric.name,
+        shown.unit,
+        p.quantity,
+        p.method,
+        p.nature,
+        float(accuracy.values[row]),
+        "" if accuracy.error is None else float(accuracy.error[row]),
+    )
+
+
+def load_json(view: LoadView) -> dict[str, Any]:
+    """Return the object of schema stochfuse.messages/1."""
+    first = view.loads[0]
+    rules: dict[str, Any] = {}
+    for load in view.loads:
+        size, error = view.bytes_of(load), load.standard_error(view.agent)
+        rules[load.rule] = {
+            "nature": load.nature,
+            "description": view.how(load),
+            "mean": load.mean(view.agent).tolist(),
+            "std": load.std(view.agent).tolist(),
+            "max": load.maximum(view.agent).tolist(),
+            **({} if error is None else {"standard_error": error.tolist()}),
+            "distribution": load.distribution(view.agent).tolist(),
+            "cdf": load.cdf(view.agent).tolist(),
+            "by_step": load.by_step(view.agent).tolist(),
+            "bytes": {"node": size.node, "mean": size.mean.tolist(), "max": size.maximum.tolist()},
+        }
+    for accuracy in view.accuracies:
+        shown, p = view.accuracy_view(accuracy), accuracy.prediction
+        rules[accuracy.load.rule]["accuracy"] = {
+            "method": p.method,
+            "quantity": p.quantity,
+            "nature": p.nature,
+            "metric": shown.metric.name,
+            "unit": shown.unit or None,
+            "description": [shown.what, shown.how],
+            "values": accuracy.values.tolist(),
+            **({} if accuracy.error is None else {"standard_error_at_most": accuracy.error.tolist()}),
+        }
+    return {
+        "schema": SCHEMA,
+        "version": __version__,
+        "link": first.link.tolist(),
+        **({} if first.cases is None else {"cases": list(first.cases)}),
+        "steps": first.steps.tolist(),
+        "rules": rules,
+        "scenario": first.scenario.to_mapping(),
+        "meta": {"description": list(view.titles), "agent": view.agent, "header_bytes": view.header or 0},
+    }
+
+
+def table_3_table(rows: Sequence[Row]) -> Table:
+    """Return table 3 of the thesis beside ours, see `stochfuse.messages.table_3`."""
+    titles = (
+        "Thesis table 3: Local Fusion Graph message size in nodes, 3 agents; mean, standard deviation, maximum",
+        "thesis: sampled, 1000 runs, maximum of those; ours: exact, by architecture and steps, maximum possible",
+        "the thesis states steps 6-10, its maxima need 12 steps; its ad hoc column has the moments of a broadcast draw",
+    )
+    cells = []
+    for row in rows:
+        ours = [(f"ours, {name}, {first}-{last}", m) for (name, first, last), m in row.ours.items()]
+        cells += [(row.column, f"{row.link:g}", who, *_moments(m)) for who, m in [("thesis", row.thesis), *ours]]
+    return Table(titles, ("column", "µ", "from"), ("mean", "std", "max"), tuple(cells))
+
+
+def _moments(moments: Moments) -> tuple[str, str, str]:
+    return f"{moments.mean:.3f}", f"{moments.std:.3f}", str(moments.maximum)
+
+
+def plot_load(view: LoadView, output: Path) -> None:
+    """Draw the mean load with a band of one standard deviation, the distribution, or accuracy against load."""
+    figure = draw(view)
+    write_file(output, lambda path: figure.savefig(path, dpi=150))
+
+
+def draw(view: LoadView):
+    """Return the figure."""
+    figure = figure_class()(figsize=(7.5, 5.0), layout="constrained")
+    axes = figure.add_subplot()
+    {"moments": _draw_moments, "accuracy": _draw_accuracy}.get(view.kind, _draw_distribution)(view, axes)
+    axes.set_ylim(bottom=0)
+    axes.grid(alpha=0.3)
+    curves = len(axes.get_legend_handles_labels()[1])
+    if curves > MOST_INSIDE:
+        axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
+    else:
+        axes.legend(fontsize="small")
+    figure.suptitle("\n".join(wrap(view.what, 80)), fontsize="medium")
+    axes.set_title("\n".join(line for text in view.titles[1:] for line in wrap(text, 100)), fontsize="small")
+    return figure
+
+
+def _draw_moments(view: LoadView, axes: Any) -> None:
+    first = view.loads[0]
+    if first.cases is not None or len(first.link) == 1:
+        _draw_steps(view, axes)
+        return
+    order = np.argsort(first.link)
+    for load, marker in zip(view.loads, MARKERS, strict=False):
+        mean, std, x = load.mean(view.agent)[order], load.std(view.agent)[order], load.link[order]
+        line = axes.plot(x, mean, marker=marker if len(x) <= 30 else None, markersize=4, label=SHORT[load.rule])
+        low = np.maximum(mean - std, 0)
+        axes.fill_between(x, low, mean + std, color=line[0].get_color(), alpha=0.15, linewidth=0)
+    axes.set_xlabel("link probability µ")
+    axes.set_ylabel("mean nodes per step (band: ± one standard deviation)")
+
+
+def _draw_steps(view: LoadView, axes: Any) -> None:
+    for load, style, label, color, i in _curves(view):
+        mean = load.by_step(view.agent)[i] @ load.sizes
+        axes.plot(load.steps, mean, style, marker=".", color=color, label=label)
+    axes.set_xlabel("step k")
+    axes.set_ylabel("mean nodes per step")
+    axes.xaxis.set_major_locator(_whole_numbers())
+
+
+def _draw_distribution(view: LoadView, axes: Any) -> None:
+    widest = max(int(load.maximum(view.agent).max()) for load in view.loads)
+    for load, style, label, color, i in _curves(view):
+        values = _probabilities(load, view)[i]
+        if view.kind == "cdf":
+            whole = np.append(values, np.ones(widest + 1 - len(values)))
+            axes.plot(whole, style, color=color, label=label, drawstyle="steps-post")
+        else:
+            axes.plot(values, style, color=color, label=label, marker=".")
+    axes.set_xlabel("nodes per step")
+    axes.set_ylabel("probability of at most so many" if view.kind == "cdf" else "probability")
+    axes.xaxis.set_major_locator(_whole_numbers())
+
+
+def _curves(view: LoadView) -> Iterator[tuple[MessageLoad, str, str, Any, int]]:
+    """Load, line style, label, colour and row of every curve: a style per rule, a colour per row."""
+    from matplotlib import colormaps
+
+    names = _names(view.loads[0])
+    chosen = spread(len(names))
+    colors = colormaps["viridis"](np.linspace(0, 0.9, len(chosen)))
+    for load, style in zip(view.loads, ("-", "--"), strict=False):
+        for i, color in zip(chosen, colors, strict=True):
+            yield load, style, f"{SHORT[load.rule]}, {names[i]}", color, i
+
+
+def _whole_numbers() -> Any:
+    from matplotlib.ticker import MaxNLocator
+
+    return MaxNLocator(integer=True)
+
+
+def _draw_accuracy(view: LoadView, axes: Any) -> None:
+    for r, accuracy in enumerate(view.accuracies):
+        load = accuracy.load.mean(view.agent)
+        order = np.argsort(accuracy.load.link)
+        errors = None if accuracy.error is None else 1.96 * accuracy.error[order]
+        label = SHORT[accuracy.load.rule]
+        axes.errorbar(load[order], accuracy.values[order], errors, marker=MARKERS[r], capsize=2, label=label)
+        names = accuracy.load.cases or [f"{µ:.3g}" for µ in accuracy.load.link]
+        for i in spread(len(names)):
+            axes.annotate(
+                names[i], (load[i], accuracy.values[i]), xytext=(4, 4), textcoords="offset points", fontsize=7
+            )
+    shown = view.accuracy_view(view.accuracies[0])
+    unit = f" [{shown.unit}]" if shown.unit else ""
+    bars = "; bars: at least 95 % confidence" if view.accuracies[0].error is not None else ""
+    axes.set_xlabel(f"mean nodes per step (marks: link probability µ{bars})")
+    axes.set_ylabel(shown.metric.label.partition(" (")[0] + unit)
