@@ -16,6 +16,7 @@ from stochfuse.report.predictions import View
 from stochfuse.report.table import Table, number
 
 STYLES = ("-", "--", ":", "-.")
+RATIO = "actual / claimed"
 
 
 def side_table(views: Sequence[View]) -> Table:
@@ -92,7 +93,7 @@ def draw(views: Sequence[View]):
         axes.set_xlabel("link probability µ" if against_link else "step k")
         if not against_link:
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        if all(view.values().min() >= 0 and view.prediction.quantity != "consistency" for view in views):
+        if label != RATIO and all(view.values().min() >= 0 for view in views if _axis(view) == label):
             axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)
     quantities = [
@@ -111,6 +112,6 @@ def draw(views: Sequence[View]):
 def _axis(view: View) -> str:
     quantity = view.prediction.quantity
     if quantity == "consistency":
-        return "actual / claimed"
+        return RATIO
     unit = f" [{view.unit}]" if view.unit else ""
     return {"bias": "bias of ", "rms": "RMS error of "}.get(quantity, "") + view.noun.partition(" (")[0] + unit

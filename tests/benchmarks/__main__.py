@@ -16,7 +16,7 @@ from rich.table import Table
 
 import stochfuse as sf
 from tests import textbook
-from tests.benchmarks import literal
+from tests.benchmarks import chain, literal
 from tests.strategies import mapping
 from tests.test_accuracy import CASES
 
@@ -131,7 +131,9 @@ def show(title: str, headings: tuple[str, ...], rows: list[tuple[str, ...]]) -> 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="one round each: only that they run")
-    quick = parser.parse_args().quick
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the contact chain's cost against n and k")
+    given = parser.parse_args()
+    quick = given.quick
     rounds = 1 if quick else 7
     rows = [
         against_literal("1001 µ × 100 steps × 50 agents, 4 states", "benign", 50, 4 if quick else 100, "≥ 60", rounds),
@@ -154,6 +156,19 @@ def main() -> None:
         [enumeration(2 if quick else 3)],
     )
     show("Three agents, scalar, one µ: seconds here", ("work", "time", "memory", "bound"), absolute(quick))
+    show(
+        "Contact chain and message load: seconds here",
+        ("work", "time", "bound of the value", "promised"),
+        chain.promised(quick),
+    )
+    grown = chain.growth(quick)
+    show(
+        "Contact chain, one µ: cost against n and k",
+        ("", "first", "last", "slope of the upper half"),
+        chain.slopes(grown),
+    )
+    if given.plot:
+        chain.plot(grown, given.plot)
     show(
         "Start-up, wall time", ("command", "bare app", "stochfuse", "ratio", "bound", ""), start_up(1 if quick else 21)
     )
