@@ -26,6 +26,13 @@ if TYPE_CHECKING:
     from stochfuse.errors import UsageError as UsageError
     from stochfuse.fusion_graph import FusionGraph as FusionGraph
     from stochfuse.fusion_graph import load_history as load_history
+    from stochfuse.inverse.agents_needed import AgentsNeeded as AgentsNeeded
+    from stochfuse.inverse.agents_needed import agents_needed as agents_needed
+    from stochfuse.inverse.least_link import LeastLink as LeastLink
+    from stochfuse.inverse.least_link import least_link as least_link
+    from stochfuse.inverse.sensitivity import Sensitivity as Sensitivity
+    from stochfuse.inverse.sensitivity import sensitivity as sensitivity
+    from stochfuse.inverse.sensitivity import share_of_gain as share_of_gain
     from stochfuse.messages import MessageLoad as MessageLoad
     from stochfuse.messages import message_load as message_load
     from stochfuse.methods import predict as predict
@@ -40,51 +47,65 @@ if TYPE_CHECKING:
     from stochfuse.symbolic_optimal import derive_optimal as derive_optimal
 
 _HOME = {
+    "AgentsNeeded": "inverse.agents_needed",
     "Comparison": "comparison",
     "FusionGraph": "fusion_graph",
+    "LeastLink": "inverse.least_link",
     "MessageLoad": "messages",
     "NoAnswerError": "errors",
     "Prediction": "prediction",
     "Scenario": "scenario",
     "ScenarioError": "errors",
+    "Sensitivity": "inverse.sensitivity",
     "StochfuseError": "errors",
     "UsageError": "errors",
-    "compare": "comparison",
+    "agents_needed": "inverse.agents_needed",
     "check_results": "crosscheck",
+    "compare": "comparison",
     "derive_general": "symbolic_general",
     "derive_optimal": "symbolic_optimal",
     "derive_simplified": "symbolic",
+    "least_link": "inverse.least_link",
     "load_history": "fusion_graph",
     "load_scenario": "scenario",
     "message_load": "messages",
     "predict": "methods",
     "predict_states": "states",
     "read_results": "results",
+    "sensitivity": "inverse.sensitivity",
+    "share_of_gain": "inverse.sensitivity",
     "steady_state": "questions",
 }
 
 __all__ = [
+    "AgentsNeeded",
     "Comparison",
     "FusionGraph",
+    "LeastLink",
     "MessageLoad",
     "NoAnswerError",
     "Prediction",
     "Scenario",
     "ScenarioError",
+    "Sensitivity",
     "StochfuseError",
     "UsageError",
     "__version__",
+    "agents_needed",
     "check_results",
     "compare",
     "derive_general",
     "derive_optimal",
     "derive_simplified",
+    "least_link",
     "load_history",
     "load_scenario",
     "message_load",
     "predict",
     "predict_states",
     "read_results",
+    "sensitivity",
+    "share_of_gain",
     "steady_state",
 ]
 

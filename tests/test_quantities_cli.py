@@ -146,3 +146,10 @@ def test_wrong_requests(arguments, message):
     done = run("predict", *arguments, code=2)
     assert message in done.stderr
     assert done.stdout == ""
+
+
+def test_bursty_links_are_not_asked_backwards(tmp_path):
+    path = tmp_path / "bursts.json"
+    path.write_text(json.dumps(mapping(1, 25, 1, 100, 100, 2, 3, burst=BURST)))
+    for question in (["--target", "30"], ["--sensitivity"], ["--gain"]):
+        assert "network.burst: expected links without memory" in run("solve", str(path), *question, code=2).stderr

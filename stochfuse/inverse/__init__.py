@@ -1,0 +1,1 @@
+"""Questions asked backwards: which link probability, which link, how many agents."""

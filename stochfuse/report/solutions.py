@@ -1,0 +1,334 @@
+"""Answers to questions asked backwards, as table, CSV and JSON, with how exact they are and why they are right."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from stochfuse import __version__
+from stochfuse.inverse.agents_needed import AgentsNeeded
+from stochfuse.inverse.least_link import BESIDE, LeastLink
+from stochfuse.inverse.question import Question, described
+from stochfuse.inverse.sensitivity import Sensitivity, ShareOfGain
+from stochfuse.prediction import Prediction
+from stochfuse.report.predictions import View
+from stochfuse.report.table import Table, number, to_csv
+
+SCHEMA = "stochfuse.solution/1"
+PRECISE = 12
+"""Significant digits of link probabilities, and of values that differ by little."""
+PROOFS = {
+    "monotone": "proved: the value never rises with the link probability",
+    "polynomial": "proved: the value is a polynomial in µ, and every root was parted from the others",
+    "scan": "the value was looked at for all µ on a fine grid, and closely around every dip near the target",
+}
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """An answer, ready to be written in any format.
+
+    Parameters
+    ----------
+    kind : which question: "least-link", "agents-needed", "sensitivity", "gain" or "steady".
+    question, prediction : what was asked about, and the prediction that labels it.
+    answer : lines that say the answer in words.
+    keys, columns, rows : the table.
+    headings, records : of the CSV, beside what labels every line.
+    facts : the answer's entries of the JSON object.
+    """
+
+    kind: str
+    question: Question
+    prediction: Prediction
+    answer: tuple[str, ...]
+    keys: tuple[str, ...]
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    headings: tuple[str, ...]
+    records: tuple[tuple[Any, ...], ...]
+    facts: dict[str, Any]
+
+    @property
+    def view(self) -> View:
+        """View of the prediction."""
+        return View(self.prediction, self.question.metric, self.question.agent)
+
+    @property
+    def titles(self) -> tuple[str, ...]:
+        """The answer in words, and what it is about."""
+        when = "" if self.kind == "gain" and self.question.step is not None else f"; {self.question.when}"
+        return (*self.answer, self.view.what + when, self.view.whom, self.view.how)
+
+
+def solution_table(sheet: Sheet) -> Table:
+    """Return the answer's table under what it means."""
+    return Table(sheet.titles, sheet.keys, sheet.columns, sheet.rows)
+
+
+def solution_csv(sheet: Sheet) -> str:
+    """One line per number asked for, with everything that says what it is."""
+    p, asked = sheet.prediction, sheet.question
+    labels = ("question", "method", "quantity", "stage", "nature", "metric", "unit", "agent")
+    label = (sheet.kind, p.method, p.quantity, p.stage, p.nature, asked.metric.name, sheet.view.unit, asked.agent)
+    return to_csv((*labels, *sheet.headings), [(*label, *record) for record in sheet.records])
+
+
+def solution_json(sheet: Sheet) -> dict[str, Any]:
+    """Return the object of schema stochfuse.solution/1."""
+    p, asked = sheet.prediction, sheet.question
+    return {
+        "schema": SCHEMA,
+        "version": __version__,
+        "question": sheet.kind,
+        "method": p.method,
+        "quantity": p.quantity,
+        "metric": asked.metric.name,
+        "nature": p.nature,
+        "step": "steady" if asked.step is None else asked.step,
+        **sheet.facts,
+        "scenario": asked.scenario.to_mapping(),
+        "meta": {
+            "description": list(sheet.titles),
+            "stage": p.stage,
+            "unit": sheet.view.unit or None,
+            "agent": asked.agent,
+            "notes": list(p.notes),
+        },
+    }
+
+
+def least_link_sheet(found: LeastLink, digits: int = 5) -> Sheet:
+    """Say the least link probability, its neighbours, and what can be reached at all."""
+    asked, µ = found.question, found.link
+    low, high = found.enclosure
+    sure = max(high - µ, µ - low)
+    at_most = f"{described(asked)} is at most {found.target:.9g}"
+    if µ == 0:
+        answer = [f"No link is needed: at µ = 0 {at_most}"]
+    else:
+        answer = [f"Least link probability: µ = {number(µ, PRECISE)}, from which on {at_most}"]
+    if found.met != ((µ, 1.0),):
+        spans = "; ".join(f"from {a:.9g} to {b:.9g}" for a, b in found.met)
+        answer = [answer[0].replace(", from which on", ", where"), f"It does not stay so: met for µ {spans} only"]
+    certain = "certain within" if np.isfinite(found.bound) and found.proof != "scan" else "by rounding within"
+    reason = PROOFS[found.proof] + (f"; {certain} {sure:.1g} in µ" if sure else "") + _bounded(found.bound)
+    answer.append(reason[0].upper() + reason[1:])
+    rows = [
+        ("least µ", number(µ, PRECISE)),
+        ("target", f"{found.target:.{PRECISE}g}"),
+        ("value at µ", number(found.value, PRECISE)),
+        (f"value at µ − {BESIDE:g}", number(found.below, PRECISE) if µ > 0 else "none"),
+        (f"value at µ + {BESIDE:g}", number(found.above, PRECISE) if µ < 1 else "none"),
+        *((f"value at µ = {end}", number(v, digits)) for end, v in enumerate(found.reachable)),
+        ("share of the gain", "none" if found.share is None else f"{100 * found.share:.4g} %"),
+    ]
+    zero, one = (v if np.isfinite(v) else None for v in found.reachable)
+    facts = {
+        "target": found.target,
+        "link": µ,
+        "value": found.value,
+        "reachable": {"at_0": zero, "at_1": one},
+        "share_of_gain": found.share,
+        "met": [list(span) for span in found.met],
+        "certificate": {
+            "proof": found.proof,
+            "enclosure": list(found.enclosure),
+            "below": {"link": max(µ - BESIDE, 0.0), "value": found.below if np.isfinite(found.below) else None},
+            "above": {"link": min(µ + BESIDE, 1.0), "value": found.above},
+            "relative_bound": found.bound if np.isfinite(found.bound) else None,
+        },
+    }
+    headings = ("step", "target", "link", "link_low", "link_high", "value", "value_at_0", "value_at_1", "share_of_gain")
+    record = (_step(asked), found.target, µ, low, high, found.value, _blank(zero), _blank(one), _blank(found.share))
+    return Sheet(
+        "least-link",
+        asked,
+        found.prediction,
+        tuple(answer),
+        ("result",),
+        ("value",),
+        tuple(rows),
+        headings,
+        (record,),
+        facts,
+    )
+
+
+def agents_sheet(found: AgentsNeeded, digits: int = 5) -> Sheet:
+    """Say the least number of agents, and that one fewer misses the target."""
+    asked, n = found.question, found.agents
+    answer = (
+        f"Agents needed at µ = {found.link:g}: {n:,}, with which {described(asked)} is at most {found.target:.9g}",
+        "Least: " + ("one fewer misses the target" if n > 1 else "there can be no fewer") + "; more agents never raise "
+        "the value" + _bounded(found.bound),
+    )
+    tries = [(n - 1, found.fewer, "misses")] if found.fewer is not None else []
+    tries.append((n, found.value, "meets"))
+    rows = tuple((f"{k:,}", number(v, max(digits, 9)), word) for k, v, word in tries if v is not None)
+    facts = {
+        "target": found.target,
+        "link": found.link,
+        "agents": n,
+        "value": found.value,
+        "value_with_one_fewer": found.fewer,
+        "tried": [{"agents": int(k), "value": float(v)} for k, v in found.tried.T],
+        "relative_bound": found.bound if np.isfinite(found.bound) else None,
+    }
+    headings = ("step", "target", "link", "agents", "value", "value_with_one_fewer")
+    record = (_step(asked), found.target, found.link, n, found.value, _blank(found.fewer))
+    columns = ("value", f"target {found.target:.9g}")
+    return Sheet(
+        "agents-needed", asked, found.prediction, answer, ("agents",), columns, rows, headings, (record,), facts
+    )
+
+
+IMPROVEMENT = 0.01
+"""How much better a link is taken to become, for an example."""
+
+
+def sensitivity_sheet(found: Sensitivity, digits: int = 5) -> Sheet:
+    """Rank the links, and say which to improve first."""
+    asked = found.question
+    how = "exact derivatives of a polynomial in each link's µ" if found.exact else "numerical derivatives"
+    error = np.max(found.error)
+    answer = (*_advice(found), f"{how}; estimated error at most {error:.1g}")
+    rows, records = [], []
+    for rank, i in enumerate(found.order, start=1):
+        sender, to = found.links[i][0], receivers(found, int(i))
+        gain = -IMPROVEMENT * found.derivative[i]
+        rows.append(
+            (str(sender), to, f"{found.link[i]:.6g}", number(float(found.derivative[i]), digits), f"{-gain:+.3g}")
+        )
+        records.append(
+            (_step(asked), rank, sender, to, found.link[i], found.derivative[i], found.error[i], found.value)
+        )
+    facts = {
+        "value": found.value,
+        "derivatives": "exact" if found.exact else "numerical",
+        "improve_first": [_link(found, i) for i in found.first],
+        "links": [
+            {
+                **_link(found, int(i)),
+                "link": float(found.link[i]),
+                "derivative": float(found.derivative[i]),
+                "estimated_error": float(found.error[i]),
+            }
+            for i in found.order
+        ],
+    }
+    columns = ("µ", "d value / dµ", f"µ + {IMPROVEMENT:g}")
+    headings = ("step", "rank", "sender", "receiver", "link", "derivative", "estimated_error", "value")
+    return Sheet(
+        "sensitivity",
+        asked,
+        found.prediction,
+        answer,
+        ("from", "to"),
+        columns,
+        tuple(rows),
+        headings,
+        tuple(records),
+        facts,
+    )
+
+
+def receivers(found: Sensitivity, i: int) -> str:
+    """Whom a link reaches: an agent's number, or all."""
+    heard = found.links[i][1]
+    return "all" if found.question.scenario.network.architecture == "broadcast" else str(heard[0])
+
+
+def _link(found: Sensitivity, i: int) -> dict[str, Any]:
+    return {"sender": found.links[i][0], "receivers": list(found.links[i][1])}
+
+
+def _advice(found: Sensitivity) -> Sequence[str]:
+    if not found.first:
+        why = "; links of probability 1 cannot get better" if (found.link == 1).any() else ""
+        if found.question.agent == "worst":
+            why += "; where several agents are the worst, all of them must get better"
+        return (f"No single link that is made better lowers the value{why}",)
+    best = found.first[0]
+    gain = -IMPROVEMENT * found.derivative[best]
+    worth = (
+        f"about {gain:.3g} of {found.value:.6g} ({100 * gain / abs(found.value):.2g} %)"
+        if found.value
+        else f"{gain:.3g}"
+    )
+    names = [f"from agent {found.links[i][0]} to {receivers(found, i)}" for i in found.first]
+    if len(names) == len(found.links) > 1:
+        return (f"No link is better to improve than another: +{IMPROVEMENT:g} on any one lowers the value by {worth}",)
+    which = f"the link {names[0]}" if len(names) == 1 else f"one of the {len(names)} links {', '.join(names)}"
+    return (f"Improve first: {which}; +{IMPROVEMENT:g} there lowers the value by {worth}",)
+
+
+def gain_sheet(found: ShareOfGain, digits: int = 5) -> Sheet:
+    """Tabulate which share of the way from µ = 0 to µ = 1 each row has gone."""
+    asked, p = found.question, found.prediction
+    steps = ["steady"] if found.steps is None else [int(k) for k in found.steps]
+    columns = tuple(k if isinstance(k, str) else f"k={k}" for k in steps)
+    answer = ["Share of the gain reached, in per cent: (E(0) − E(µ)) / (E(0) − E(1))"]
+    half = np.flatnonzero(p.link == 0.5)
+    if p.cases is None and len(half) and np.isfinite(found.share[half[0]]).all():
+        first, last = np.min(found.share[half[0]]), np.max(found.share[half[0]])
+        span = f"{100 * first:.3g}" + (f" to {100 * last:.3g}" if len(steps) > 1 else "")
+        answer.append(f"At µ = 0.5 it is {span} % (the thesis: about 70 %)")
+    rows, records = [], []
+    for i, µ in enumerate(p.link):
+        name = () if p.cases is None else (p.cases[i],)
+        shares = [number(100 * s, digits) if np.isfinite(s) else "none" for s in found.share[i]]
+        rows.append((*name, f"{µ:.6g}", *shares))
+        for c, k in enumerate(steps):
+            share = found.share[i, c]
+            records.append((*(name or ("",)), µ, k, share if np.isfinite(share) else "", found.value[i, c]))
+    facts = {
+        "link": p.link.tolist(),
+        **({} if p.cases is None else {"cases": list(p.cases)}),
+        "steps": steps,
+        "share_of_gain": [[float(s) if np.isfinite(s) else None for s in row] for row in found.share],
+        "values": found.value.tolist(),
+        "reachable": {"at_0": found.reachable[0].tolist(), "at_1": found.reachable[1].tolist()},
+    }
+    keys = ("µ",) if p.cases is None else ("links", "mean µ")
+    headings = ("case", "link", "step", "share_of_gain", "value")
+    return Sheet("gain", asked, p, tuple(answer), keys, columns, tuple(rows), headings, tuple(records), facts)
+
+
+def steady_sheet(asked: Question, prediction: Prediction, digits: int = 5) -> Sheet:
+    """Tabulate the steady state against link probability, with its proved bound."""
+    p, values = prediction, asked.read(prediction)
+    bounds = np.full(len(values), np.inf) if p.steady_bound is None else p.steady_bound.max(axis=1)
+    answer = ("Steady state against link probability, P = g(P), with a proved relative bound on the covariance",)
+    rows, records = [], []
+    for i, µ in enumerate(p.link):
+        name = () if p.cases is None else (p.cases[i],)
+        proved = bool(np.isfinite(bounds[i]))
+        rows.append((*name, f"{µ:.6g}", number(values[i], digits), f"{bounds[i]:.0e}" if proved else "not proved"))
+        records.append((*(name or ("",)), µ, "steady", values[i], bounds[i] if proved else ""))
+    facts = {
+        "link": p.link.tolist(),
+        **({} if p.cases is None else {"cases": list(p.cases)}),
+        "values": values.tolist(),
+        "relative_bound": [float(b) if np.isfinite(b) else None for b in bounds],
+    }
+    keys = ("µ",) if p.cases is None else ("links", "mean µ")
+    headings = ("case", "link", "step", "value", "relative_bound")
+    return Sheet("steady", asked, p, answer, keys, ("steady", "bound"), tuple(rows), headings, tuple(records), facts)
+
+
+def _bounded(bound: float) -> str:
+    if not bound:
+        return ""
+    return f"; values proved to a relative {bound:.0e}" if np.isfinite(bound) else "; values at rounding, not proved"
+
+
+def _step(asked: Question) -> int | str:
+    return "steady" if asked.step is None else asked.step
+
+
+def _blank(value: float | None) -> float | str:
+    return "" if value is None else value
