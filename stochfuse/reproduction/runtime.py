@@ -8,10 +8,10 @@ from typing import Any
 
 from stochfuse import __version__
 from stochfuse.methods import predict
+from stochfuse.report.reproductions import SCHEMA
 from stochfuse.report.table import Table
 from stochfuse.scenario import load_scenario
 
-SCHEMA = "stochfuse.reproduction/1"
 THESIS_SIMULATION, THESIS_MODEL = 12_000.0, 2.0
 """Seconds for 1000 runs of the Local Fusion Graph, and for one run of the stochastic model, thesis 4.3."""
 RUNS = 1000

@@ -1,0 +1,289 @@
+"""What the thesis found beside what is found here, as tables, CSV, JSON and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from textwrap import wrap
+from typing import Any
+
+import numpy as np
+
+from stochfuse import __version__
+from stochfuse.report.export import write_file
+from stochfuse.report.plot import MARKERS, figure_class
+from stochfuse.report.table import Table, number, to_csv
+
+SCHEMA = "stochfuse.reproduction/1"
+VERDICTS = ("agrees", "differs", "explained", "open")
+MEANING = (
+    "agrees: our numbers meet the criterion; differs: they do not; explained: the thesis' finding and its cause are "
+    "both shown by numbers; open: not decided"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One curve of a panel.
+
+    Parameters
+    ----------
+    name : what it is.
+    y : (points,) values.
+    low, high : (points,) ends of a band around it, or None.
+    at : (points,) abscissae of its own, where the panel's x only names the points; or None.
+    """
+
+    name: str
+    y: np.ndarray
+    low: np.ndarray | None = None
+    high: np.ndarray | None = None
+    at: np.ndarray | None = None
+
+    def rows(self, x_label: str) -> list[tuple[str, np.ndarray]]:
+        """Name and values of everything that the curve consists of."""
+        parts = ((x_label, self.at), ("", self.y), ("lowest", self.low), ("highest", self.high))
+        return [(f"{self.name}{', ' * bool(what)}{what}", v) for what, v in parts if v is not None]
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """Curves over one axis.
+
+    Parameters
+    ----------
+    title : what is shown: claimed or actual, exact or sampled, averaged over what.
+    x_label, y_label : axes, with units.
+    points : heading of every point in tables.
+    x : (points,) abscissae.
+    curves : the curves.
+    y_range : ends of the ordinate as the thesis has it, where that is known.
+    bars : whether bars are drawn, as in a histogram.
+    """
+
+    title: str
+    x_label: str
+    y_label: str
+    points: tuple[str, ...]
+    x: np.ndarray
+    curves: tuple[Curve, ...]
+    y_range: tuple[float, float] | None = None
+    bars: bool = False
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A statement of the thesis and what our numbers say to it.
+
+    Parameters
+    ----------
+    items : keys of the figures and tables that it is about.
+    thesis : the statement, in our words.
+    ours : our numbers.
+    criterion : what the verdict follows from.
+    verdict : one of `VERDICTS`.
+    """
+
+    items: tuple[str, ...]
+    thesis: str
+    ours: str
+    criterion: str
+    verdict: str
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A figure or table of the thesis with everything that is shown for it.
+
+    Parameters
+    ----------
+    key : "figure-32" or "table-3".
+    title : what the thesis shows there, in our words.
+    notes : what the reader should know, one sentence each.
+    panels : data.
+    facts : (name, in the thesis, here) for tables of parameters.
+    findings : statements about it.
+    """
+
+    key: str
+    title: str
+    notes: tuple[str, ...] = ()
+    panels: tuple[Panel, ...] = ()
+    facts: tuple[tuple[str, str, str], ...] = ()
+    findings: tuple[Finding, ...] = ()
+
+
+def name_of(key: str) -> str:
+    """Return a key for people: "figure 32"."""
+    return key.replace("-", " ")
+
+
+def data_tables(sheet: Sheet, digits: int = 5) -> list[Table]:
+    """Return a table per panel (rows of curves, columns of points), or of the facts."""
+    head = (f"Thesis {name_of(sheet.key)}: {sheet.title}", *(f"note: {note}" for note in sheet.notes))
+    if sheet.facts:
+        return [Table(head, ("parameter", "thesis", "here"), (), sheet.facts)]
+    tables = []
+    for i, panel in enumerate(sheet.panels):
+        rows = [
+            (name, *(number(value, digits) if value else "0" for value in values))
+            for curve in panel.curves
+            for name, values in curve.rows(panel.x_label)
+        ]
+        title = (*(head if i == 0 else ()), f"{panel.title}: {panel.y_label}, by {panel.x_label}")
+        tables.append(Table(title, ("curve",), panel.points, tuple(rows)))
+    return tables
+
+
+def sheet_tables(sheet: Sheet, digits: int = 5) -> list[Table]:
+    """Return all tables of an item, the statements last."""
+    tables = data_tables(sheet, digits)
+    return [*tables, findings_table(sheet.findings, everywhere=False)] if sheet.findings else tables
+
+
+def findings_table(findings: Sequence[Finding], title: Sequence[str] = (), *, everywhere: bool = True) -> Table:
+    """Return the statements of the thesis beside our numbers, with verdicts.
+
+    Parameters
+    ----------
+    everywhere : whether it is said what each statement is about.
+    """
+    rows = tuple(
+        (
+            *((where(finding.items),) if everywhere else ()),
+            finding.thesis,
+            f"{finding.ours} [{finding.criterion}]",
+            finding.verdict,
+        )
+        for finding in findings
+    )
+    keys = ("where",) if everywhere else ()
+    return Table((*title, MEANING), (*keys, "the thesis finds", "here [criterion]", "verdict"), (), rows)
+
+
+def where(items: Sequence[str]) -> str:
+    """Return the short names of some items: "fig. 20, 21, table 3"."""
+    kinds: dict[str, list[str]] = {}
+    for item in items:
+        kind, _, rest = item.partition("-")
+        kinds.setdefault("fig." if kind == "figure" else kind, []).append(rest)
+    return ", ".join(f"{kind} {', '.join(numbers)}".strip() for kind, numbers in kinds.items())
+
+
+def listing_table(entries: Sequence[tuple[str, str]]) -> Table:
+    """Return what can be reproduced."""
+    title = ("What of the thesis can be reproduced: `stochfuse reproduce KEY`",)
+    return Table(title, ("key", "what it shows"), (), tuple(entries))
+
+
+def sheet_csv(sheets: Sequence[Sheet]) -> str:
+    """One line per point of every curve."""
+    rows = []
+    for sheet in sheets:
+        rows += [(sheet.key, "", name, "", "", there, here, "") for name, there, here in sheet.facts]
+        for panel in sheet.panels:
+            for curve in panel.curves:
+                for name, values in curve.rows(panel.x_label):
+                    rows += [
+                        (sheet.key, panel.title, name, panel.x_label, float(x), "", float(y), panel.y_label)
+                        for x, y in zip(panel.x, values, strict=True)
+                    ]
+    return to_csv(("item", "panel", "curve", "x_name", "x", "thesis", "value", "value_name"), rows)
+
+
+def findings_csv(findings: Sequence[Finding]) -> str:
+    """One line per statement."""
+    rows = [(" ".join(f.items), f.thesis, f.ours, f.criterion, f.verdict) for f in findings]
+    return to_csv(("items", "thesis", "ours", "criterion", "verdict"), rows)
+
+
+def sheet_json(sheet: Sheet) -> dict[str, Any]:
+    """Return one item as an object."""
+    return {
+        **_head(sheet.key),
+        "title": sheet.title,
+        "notes": list(sheet.notes),
+        "panels": [_panel_json(panel) for panel in sheet.panels],
+        "facts": [{"name": name, "thesis": there, "here": here} for name, there, here in sheet.facts],
+        "statements": [_finding_json(finding) for finding in sheet.findings],
+    }
+
+
+def findings_json(findings: Sequence[Finding]) -> dict[str, Any]:
+    """Return statements as an object."""
+    return {**_head("statements"), "verdicts": MEANING, "statements": [_finding_json(f) for f in findings]}
+
+
+def listing_json(entries: Sequence[tuple[str, str]]) -> dict[str, Any]:
+    """Return what can be reproduced as an object."""
+    return {**_head("list"), "items": [{"key": key, "title": title} for key, title in entries]}
+
+
+def _head(what: str) -> dict[str, Any]:
+    return {"schema": SCHEMA, "version": __version__, "what": what}
+
+
+def _finding_json(finding: Finding) -> dict[str, Any]:
+    return {
+        "items": list(finding.items),
+        "thesis": finding.thesis,
+        "ours": finding.ours,
+        "criterion": finding.criterion,
+        "verdict": finding.verdict,
+    }
+
+
+def _panel_json(panel: Panel) -> dict[str, Any]:
+    curves = [
+        {
+            "name": curve.name,
+            "y": curve.y.tolist(),
+            **{key: getattr(curve, key).tolist() for key in ("low", "high", "at") if getattr(curve, key) is not None},
+        }
+        for curve in panel.curves
+    ]
+    axes = {"x_label": panel.x_label, "y_label": panel.y_label, "x": panel.x.tolist()}
+    return {"title": panel.title, **axes, "points": list(panel.points), "curves": curves}
+
+
+def plot_sheet(sheet: Sheet, output: Path) -> None:
+    """Draw an item on the thesis' axes, a panel beside the other."""
+    figure = draw(sheet)
+    write_file(output, lambda path: figure.savefig(path, dpi=150))
+
+
+def draw(sheet: Sheet):
+    """Return the figure, not shown and not registered with pyplot."""
+    n = max(1, len(sheet.panels))
+    columns = min(n, 2)
+    figure = figure_class()(figsize=(6.2 * columns + 0.6, 4.6 * -(-n // columns) + 0.6), layout="constrained")
+    figure.suptitle("\n".join(wrap(f"Thesis {name_of(sheet.key)}: {sheet.title}", 55 * columns)), fontsize="medium")
+    for i, panel in enumerate(sheet.panels, start=1):
+        _draw_panel(figure.add_subplot(-(-n // columns), columns, i), panel)
+    return figure
+
+
+def _draw_panel(axes, panel: Panel) -> None:
+    from matplotlib import colormaps
+
+    own = any(curve.at is not None for curve in panel.curves)
+    colors = colormaps["viridis"](np.linspace(0, 0.9, len(panel.curves)))
+    width = 0.8 / len(panel.curves)
+    for i, (curve, color) in enumerate(zip(panel.curves, colors, strict=True)):
+        x = panel.x if curve.at is None else curve.at
+        if panel.bars:
+            axes.bar(x + (i - (len(panel.curves) - 1) / 2) * width, curve.y, width, color=color, label=curve.name)
+            continue
+        axes.plot(x, curve.y, color=color, marker=MARKERS[i % len(MARKERS)], markersize=4, label=curve.name)
+        if curve.low is not None and curve.high is not None:
+            axes.fill_between(x, curve.low, curve.high, color=color, alpha=0.15, linewidth=0)
+    if not own:
+        axes.set_xticks(panel.x, panel.points)
+    axes.set_xlabel(panel.x_label)
+    axes.set_ylabel("\n".join(wrap(panel.y_label, 45)))
+    if panel.y_range is not None:
+        axes.set_ylim(*panel.y_range)
+    axes.set_title("\n".join(wrap(panel.title, 60)), fontsize="small")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="x-small")

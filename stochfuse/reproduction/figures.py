@@ -1,0 +1,208 @@
+"""Families of figures: each makes the panels of many figures from the same few numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from stochfuse.report.reproductions import Curve, Panel
+from stochfuse.reproduction import records
+from stochfuse.reproduction.bench import (
+    ARCHITECTURES,
+    LFG,
+    LINKS,
+    NAIVE,
+    SIMPLIFIED,
+    TRANSIENT,
+    Bench,
+    Case,
+    Weights,
+)
+
+FEW = 20
+"""Records whose spread is shown."""
+RULES = {LFG: "Local Fusion Graph", NAIVE: "naive fusion", SIMPLIFIED: "simplified (53)/(54)"}
+CONNECTIVITY = "average connectivity"
+ONE = "given one record of truth and measurements (seed {}, record 1), averaged over links as the thesis does, exact"
+NOISE = "averaged over links and noise, exact"
+Make = Callable[[Bench], tuple[Panel, ...]]
+
+
+def percent(link: float) -> str:
+    """Return a link probability as the thesis names it: 25 %."""
+    return f"{100 * link:g} %"
+
+
+def over_steps(bench: Bench, title: str, y: str, curves: Sequence[Curve], y_range=None) -> Panel:
+    """Return curves over the time step."""
+    x = np.arange(1, bench.steps + 1)
+    return Panel(title, "time step", y, tuple(f"k={k}" for k in x), x, tuple(curves), y_range)
+
+
+def over_links(title: str, y: str, curves: Sequence[Curve], links: Sequence[float] = LINKS) -> Panel:
+    """Return curves over the link probability."""
+    return Panel(title, CONNECTIVITY, y, tuple(map(percent, links)), np.array(links), tuple(curves))
+
+
+def per_link(values: np.ndarray, name: str = "") -> list[Curve]:
+    """Return a curve over steps per link probability, of values (links, steps)."""
+    return [Curve(name + percent(link), row) for link, row in zip(LINKS, values, strict=True)]
+
+
+def covariance(case: Case, architecture: str, rules: Sequence[str] = (LFG,)) -> Make:
+    """Figures 20–22, 36–38, 56, 58, 65, 66: claimed covariance over time, one curve per connectivity."""
+
+    def make(bench: Bench) -> tuple[Panel, ...]:
+        return tuple(
+            over_steps(
+                bench,
+                f"{RULES[rule]}, {'approximate' if rule == SIMPLIFIED else 'exact average over links'}",
+                "claimed covariance",
+                per_link(bench.claimed(case, architecture, rule=rule)),
+            )
+            for rule in rules
+        )
+
+    return make
+
+
+def normalised(case: Case, architecture: str) -> Make:
+    """Figures 23–25, 39–41: claimed covariance relative to that without links, one curve per step."""
+
+    def make(bench: Bench) -> tuple[Panel, ...]:
+        P = bench.claimed(case, architecture)
+        curves = [Curve(f"k={k}", column) for k, column in enumerate((P / P[0]).T, start=1)]
+        return (over_links("Local Fusion Graph, exact average over links", "claimed covariance / that at 0 %", curves),)
+
+    return make
+
+
+def states(case: Case, architecture: str, rules: Sequence[str] = (LFG,)) -> Make:
+    """Figures 26–28, 42–44, 57, 59, 69, 70: mean state estimate over time, with the truth."""
+
+    def make(bench: Bench) -> tuple[Panel, ...]:
+        scenario = bench.scenario(case, architecture)
+        drawn = records.draw(scenario, 1, bench.seed)
+        panels = []
+        for rule in rules:
+            weights = bench.weights(case, architecture, rule=rule)
+            true = records.truth(scenario, drawn)[0]
+            expected = np.full(bench.steps, records.TRUTH)
+            for title, x, error in (
+                (NOISE, expected, weights.first[..., -1]),
+                (ONE.format(bench.seed), true, weights.mean_given(drawn)[0]),
+            ):
+                curves = [Curve("true state", x), *per_link(x + error)]
+                panels.append(over_steps(bench, f"{RULES[rule]}, {title}", "mean state estimate", curves))
+        return tuple(panels)
+
+    return make
+
+
+def errors(case: Case, architecture: str) -> Make:
+    """Figures 29–31, 45–47: RMS error over time, one curve per connectivity."""
+
+    def make(bench: Bench) -> tuple[Panel, ...]:
+        scenario, weights = bench.scenario(case, architecture), bench.weights(case, architecture)
+        one = weights.rms_given(records.draw(scenario, 1, bench.seed))[0]
+        y = "RMS error (actual)"
+        return (
+            over_steps(bench, f"Local Fusion Graph, {NOISE}", y, per_link(weights.rms(records.spread(scenario)))),
+            over_steps(bench, f"Local Fusion Graph, {ONE.format(bench.seed)}", y, per_link(one)),
+        )
+
+    return make
+
+
+def time_average(rms: np.ndarray) -> np.ndarray:
+    """RMS errors averaged over the steps but the first, as the thesis averages them; (..., steps) to (...)."""
+    return rms[..., 1:].mean(axis=-1)
+
+
+def averaged_errors(
+    bench: Bench, weights: Weights, case: Case, architecture: str, data: str = "own", *, initial_error: bool = True
+) -> np.ndarray:
+    """Return the time-averaged RMS error, averaged over the noise, (links,)."""
+    spread = records.spread(bench.scenario(case, architecture), data, initial_error=initial_error)
+    return time_average(weights.rms(spread))
+
+
+def errors_of_records(
+    bench: Bench, weights: Weights, case: Case, architecture: str, number: int, data: str = "own"
+) -> np.ndarray:
+    """Return the time-averaged RMS error of single records, (records, links)."""
+    drawn = records.draw(bench.scenario(case, architecture), number, bench.seed, data)
+    return time_average(weights.rms_given(drawn))
+
+
+def change(values: np.ndarray) -> np.ndarray:
+    """Change against the first link probability, in per cent of it, along the last axis."""
+    return 100.0 * (values / values[..., :1] - 1.0)
+
+
+def averaged_over_time(
+    cases: Sequence[tuple[str, Case, str]], links: Sequence[float] = LINKS, variants: Sequence[str] = ()
+) -> Make:
+    """Figures 32–35, 48: time-averaged RMS error over connectivity, one curve per (name, case, architecture).
+
+    Parameters
+    ----------
+    variants : further panels: "no initial error", or other records, see `stochfuse.reproduction.records`.
+    """
+
+    def make(bench: Bench) -> tuple[Panel, ...]:
+        found = [(name, case, a, bench.weights(case, a, links)) for name, case, a in cases]
+        y = f"RMS error (actual), mean over steps 2–{bench.steps}"
+        single = [(n, errors_of_records(bench, w, c, a, FEW)) for n, c, a, w in found]
+        panels = [
+            over_links(NOISE, y, [Curve(n, averaged_errors(bench, w, c, a)) for n, c, a, w in found], links),
+            over_links(ONE.format(bench.seed), y, [Curve(n, e[0]) for n, e in single], links),
+            over_links(
+                f"{FEW} single records: median, lowest and highest",
+                "change of that RMS error against 0 %, in per cent of it",
+                [
+                    Curve(n, np.median(change(e), axis=0), change(e).min(axis=0), change(e).max(axis=0))
+                    for n, e in single
+                ],
+                links,
+            ),
+        ]
+        for variant in variants:
+            title, options = VARIANTS[variant]
+            curves = [Curve(n, averaged_errors(bench, w, c, a, **options)) for n, c, a, w in found]
+            panels.append(over_links(f"{NOISE}, {title}", y, curves, links))
+        return tuple(panels)
+
+    return make
+
+
+VARIANTS = {
+    "no-error": ("without the common initial error", {"initial_error": False}),
+    "start": ("all agents start from one estimate, fused as if each had its own", {"data": "start"}),
+    "all": ("all agents have one initial estimate and one measurement of each step", {"data": "all"}),
+}
+
+
+def by_architecture(case: Case) -> list[tuple[str, Case, str]]:
+    """Return the three networks of the thesis in one scenario."""
+    return [(a.replace("-", " "), case, a) for a in ARCHITECTURES]
+
+
+RATIOS = (("1/16", 6.25), ("1/4", 25.0), ("4", 400.0))
+"""Ratios Q/R; the thesis' own three are not in its text, only 1:4 is."""
+
+
+def by_ratio(architecture: str) -> list[tuple[str, Case, str]]:
+    """Return the transient scenario with three ratios of process to measurement noise, R = P(k0) = 100."""
+    return [(f"Q/R = {name}", Case("transient", q=q), architecture) for name, q in RATIOS]
+
+
+def sample_run(bench: Bench) -> tuple[Panel, ...]:
+    """Figure 19: one run, and what any run can give."""
+    run = bench.sample(TRANSIENT, "ad-hoc", LINKS, 2)[:, 0]
+    return (
+        over_steps(
+            bench, f"one run (seed {bench.seed}, agent 1), sampled", "claimed covariance", per_link(run), (0, 100)
+        ),
+    )
