@@ -102,8 +102,10 @@ def predict(
         raise TypeError(f"predict() got an unexpected keyword argument '{sorted(unknown)[0]}'")
     how = Settings(**settings)
     choose("estimator", how.estimator, ESTIMATORS)
-    if steady and (method != "simplified" or quantity != "claimed"):
-        raise UsageError(f"steady: expected method simplified and quantity claimed, got {method} and {quantity}")
+    if steady and method != "simplified":
+        raise UsageError(f"steady: expected method simplified, got {method}")
+    if steady and quantity != "claimed":
+        raise UsageError(f"steady: expected quantity claimed, got {quantity}")
     rows = link_rows(scenario, link)
     if quantity == "optimal":
         method, how = ("monte-carlo" if method == "monte-carlo" else "optimal"), replace(how, estimator="optimal")

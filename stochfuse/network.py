@@ -137,19 +137,23 @@ def mean_delivery(burst: np.ndarray) -> np.ndarray:
     return (bad_to_good * good + good_to_bad * bad) / (good_to_bad + bad_to_good)
 
 
-def delivery_after_failures(burst: np.ndarray, most: int) -> np.ndarray:
-    """Probability of a delivery after 0, 1 … most failures in a row, of (rows, 4) bursts, shape (rows, most + 1).
+def delivery_after_failures(burst: np.ndarray, in_time: np.ndarray) -> np.ndarray:
+    """Probability of a delivery in time after 0, 1 … failures in a row, of (rows, 4) bursts, shape (rows, failures).
 
     A chain of two states is reversible, so that the row of failures may lie in the past or in the future.
+
+    Parameters
+    ----------
+    in_time : (failures,) probability that a delivery after so many failures is in time; a late one is a failure too.
     """
     good_to_bad, bad_to_good, *delivery = np.moveaxis(burst, -1, 0)
     deliver = np.stack(delivery, axis=1)
     move = np.array([[1.0 - good_to_bad, good_to_bad], [bad_to_good, 1.0 - bad_to_good]]).transpose(2, 0, 1)
     state = np.stack([bad_to_good, good_to_bad], axis=1) / (good_to_bad + bad_to_good)[:, None]
     out = []
-    for _ in range(most + 1):
-        out.append((state * deliver).sum(axis=1))
-        failed = state * (1.0 - deliver)
+    for share in in_time:
+        out.append((state * deliver * share).sum(axis=1))
+        failed = state * (1.0 - deliver * share)
         total = failed.sum(axis=1, keepdims=True)
         # where failures cannot happen, what would follow them does not matter
         state = np.divide(failed, total, out=state.copy(), where=total > 0)

@@ -19,7 +19,7 @@ def optimum(scenario: Scenario, rows: LinkRows) -> tuple[Chain, tuple[tuple[int,
     Raises
     ------
     UsageError
-        If the chain's states or paths are too many, or delays and bursty links come together.
+        If the chain's states or paths are too many.
     """
     network, kinds = scenario.network, scenario.sensor_of
     alike = len(set(kinds)) == 1 and rows.uniform

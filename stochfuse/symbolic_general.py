@@ -211,7 +211,7 @@ def derive_general(
     q, r, p0 : process noise, measurement noise and initial variance: a number or its text, or None for a symbol.
     architecture : "ad-hoc", "broadcast" or "cyclic".
     correlation : "independent" or "shared" initial estimates.
-    estimator : "local-fusion-graph" or "naive".
+    estimator : "local-fusion-graph", "naive" or "optimal".
 
     Returns
     -------

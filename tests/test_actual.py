@@ -218,7 +218,7 @@ def test_what_cannot_be_asked():
     ):
         sf.predict(scenario, [0.5], quantity="x")
     with pytest.raises(
-        sf.UsageError, match="steady: expected method simplified and quantity claimed, got simplified and rms"
+        sf.UsageError, match="steady: expected quantity claimed, got rms"
     ):
         sf.predict(scenario, [0.5], quantity="rms", steady=True)
     notes = sf.predict(sf.load_scenario("thesis-steady", steps=2), [0.5], "general", "rms").notes

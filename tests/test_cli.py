@@ -558,7 +558,7 @@ def test_an_input_is_never_overwritten(tmp_path):
         (["predict", "--statistic", "std"], "--statistic std: expected --method general or naive, got simplified"),
         (["predict", "--method", "general", "--statistic", "mode"], "statistic: expected mean, variance, std, quantile:P"),
         (["predict", "--method", "general", "--statistic", "quantile:2"], "statistic: expected mean, variance, std, quantile:P"),
-        (["predict", "cv-2d", "--method", "general", "--steps", "2", "--statistic", "derivative"], "derivative: expected metric trace or var:STATE, got 'rms:x,y'"),
+        (["predict", "cv-2d", "--method", "general", "--steps", "2", "--statistic", "derivative"], "derivative: expected metric trace or var:STATE of quantity claimed or actual, or the bias of one state, got 'rms:x,y' of claimed"),
         (["predict", "--method", "general", "--steps", "9"], "more than --max-graphs 100000"),
         (["predict", "--method", "monte-carlo", "--runs", "1"], "Invalid value for '--runs'"),
         (["compare", "--methods", "simplified,guess"], "methods: expected one of simplified, general, optimal, naive, monte-carlo, got 'guess'"),

@@ -89,6 +89,10 @@ NETWORKS = {
     "bursts on a ring": ("cyclic", 3, 4, {"burst": BURST}, None),
     "bursts and unlike agents": ("ad-hoc", 3, 3, {"burst": BURST}, AGENTS),
     "bursts and no bursts": ("ad-hoc", 2, 4, {"case": [{"name": "b", "burst": BURST}, {"name": "m", "link": 0.3}]}, None),
+    "bursts and delays": ("ad-hoc", 2, 4, {"burst": BURST, "delay": [0.5, 0.3, 0.2]}, None),
+    "bursts and delays, three agents": ("ad-hoc", 3, 2, {"burst": BURST, "delay": [0.4, 0.6]}, None),
+    "bursts and delays, broadcast": ("broadcast", 3, 3, {"burst": BURST, "delay": [0.4, 0.6]}, AGENTS),
+    "bursts and delays on a ring": ("cyclic", 3, 4, {"burst": BURST, "delay": [0.4, 0.6]}, None),
     "bursts, unlike agents, broadcast": ("broadcast", 3, 3, {"burst": BURST}, AGENTS),
 }  # fmt: skip
 
@@ -241,9 +245,6 @@ def test_an_order_that_the_thesis_left_open():
 
 
 def test_what_the_chain_does_not_take():
-    source = strategies.mapping(1, 25, 1, 100, 100, 2, 2, burst=BURST, delay=[0.5, 0.5])
-    with pytest.raises(sf.UsageError, match="method 'optimal' takes delays or bursty links, not both: a message"):
-        sf.predict(sf.Scenario.from_mapping(source), method="optimal")
     source = strategies.mapping(1, 25, 1, 100, 100, 13, 2, link=0.5) | {"agent": [{"R": 1}] + [{}] * 12}
     with pytest.raises(sf.UsageError, match="takes at most 12 agents where they or their links differ, got 13"):
         sf.predict(sf.Scenario.from_mapping(source), method="optimal")

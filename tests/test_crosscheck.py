@@ -27,7 +27,7 @@ def samples():
     s = sf.predict(
         sf.load_scenario(steps=STEPS), [float(µ) for µ in LINKS], method="monte-carlo", runs=60_000, workers=1
     )
-    return s.sampled.sample.values[s.sampled.sample.which][..., 0, 0]
+    return s.sampled.sample.values.P[s.sampled.sample.which][..., 0, 0]
 
 
 def results(P):
@@ -73,7 +73,7 @@ def test_two_per_cent_in_one_cell_are_found(samples, prediction, cell):
 def test_two_per_cent_in_the_simulators_noise_are_found(prediction, change):
     wrong = sf.load_scenario(steps=STEPS, **change)
     s = sf.predict(wrong, [float(µ) for µ in LINKS], method="monte-carlo", runs=20_000, workers=1).sampled.sample
-    assert not verdict(s.values[s.which][..., 0, 0], prediction).agrees
+    assert not verdict(s.values.P[s.which][..., 0, 0], prediction).agrees
 
 
 def test_a_small_error_everywhere_is_found_together(samples, prediction):
@@ -98,7 +98,7 @@ def test_rare_outcomes_that_were_not_seen_are_reckoned_with():
 def simulated(scenario, link, runs, seed, of=lambda P: np.trace(P, axis1=-2, axis2=-1)):
     """Honest results of one link probability."""
     s = sf.predict(scenario, [link], method="monte-carlo", runs=runs, seed=seed, workers=1).sampled.sample
-    P = of(s.values)[s.which]
+    P = of(s.values.P)[s.which]
     _, run, step, agent = (i.ravel() for i in np.indices(P.shape))
     return Results(
         "simulator", np.full(P.size, str(link)), step + 1, agent + 1, P.ravel(), run, None, None, None, np.arange(P.size), "line", 0.0

@@ -30,7 +30,7 @@ def test_more_runs_of_a_seed_begin_with_the_fewer():
     few, many = (
         sf.predict(sf.load_scenario(), [0.5], method="monte-carlo", runs=n).sampled.sample for n in (1000, 3000)
     )
-    np.testing.assert_allclose(many.values[many.which[:, :1000]], few.values[few.which], rtol=1e-12)
+    np.testing.assert_allclose(many.values.P[many.which[:, :1000]], few.values.P[few.which], rtol=1e-12)
 
 
 def test_standard_errors_are_honest():

@@ -17,8 +17,8 @@ the steps since it joined, up to the longest delay D; a link into a member of ag
 
 Bursty links (Gilbert and Elliott).  A link j → i is looked at as long as i is in and j is not, and has failed every
 time; a stationary chain of two states looks the same backwards, so what is known of the link is how often it
-failed: the age of i.  The link succeeds with the probability of a delivery after so many failures in a row.  Delays and
-bursts together are not exact: a message that came too late is no failure of its link.
+failed: the age of i.  The link succeeds with the probability of a delivery after so many failures in a row.  With
+delays as well, a failure at age a is a message that was lost or came later than a steps.
 """
 
 from __future__ import annotations
@@ -70,14 +70,9 @@ def contacts(network: Network, rows: LinkRows, kinds: Sequence[int], groups: Seq
     Raises
     ------
     UsageError
-        If delays and bursts come together, or the states are too many.
+        If the states are too many.
     """
-    delayed, bursty = network.delay != (1.0,), rows.bursts is not None
-    if delayed and bursty:
-        raise UsageError(
-            "method 'optimal' takes delays or bursty links, not both: a message that came too late says nothing of its "
-            "link's state; use general or monte-carlo"
-        )
+    bursty = rows.bursts is not None
     oldest = network.steps - 1 if bursty else min(len(network.delay), network.steps) - 1
     if len(set(kinds)) == 1 and rows.uniform:
         return _of_counts(network, rows, oldest)
@@ -86,9 +81,8 @@ def contacts(network: Network, rows: LinkRows, kinds: Sequence[int], groups: Seq
 
 def by_age(network: Network, µ: np.ndarray, burst: np.ndarray | None, oldest: int) -> np.ndarray:
     """Probability that a link into a member of age 0 … oldest brings its sender in, (rows, ages)."""
-    if burst is not None:
-        return delivery_after_failures(burst, oldest)
-    return µ[:, None] * np.cumsum(network.delay)[: oldest + 1]
+    in_time = np.cumsum(network.delay)[np.minimum(range(oldest + 1), len(network.delay) - 1)]
+    return µ[:, None] * in_time if burst is None else delivery_after_failures(burst, in_time)
 
 
 def _of_counts(network: Network, rows: LinkRows, oldest: int) -> Contacts:

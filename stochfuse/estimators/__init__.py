@@ -80,6 +80,29 @@ class Estimator(Protocol):
         ...
 
 
+class FusionRule:
+    """What estimators of this package have in common.
+
+    Parameters
+    ----------
+    ledger : where values are written.
+    sources : source (of start and measurements) of every agent.
+    shared : whether all agents start from one common estimate.
+    relabellings : permutations of the agents that leave network and sources as they are.
+    """
+
+    def __init__(
+        self,
+        ledger: Ledger,
+        sources: Sequence[int],
+        *,
+        shared: bool = False,
+        relabellings: Sequence[tuple[int, ...]] | None = None,
+    ) -> None:
+        self.ledger, self.sources, self.shared = ledger, tuple(sources), shared
+        self.relabellings = relabellings or [tuple(range(len(self.sources)))]
+
+
 def best_relabelling(invariants: Sequence[Hashable], relabellings: Sequence[tuple[int, ...]]) -> list[tuple[int, ...]]:
     """Return the relabellings of like agents that put invariants into their least order.
 

@@ -27,7 +27,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from stochfuse.estimators import Late, best_relabelling
+from stochfuse.estimators import FusionRule, Late, best_relabelling
 from stochfuse.information import COMMON, Ledger
 
 
@@ -106,29 +106,10 @@ class Pedigrees:
         return known
 
 
-class LocalFusionGraph:
-    """The estimator.
-
-    Parameters
-    ----------
-    ledger : where values are written.
-    sources : source (of start and measurements) of every agent.
-    shared : whether all agents start from one common estimate.
-    relabellings : permutations of the agents that leave network and sources as they are.
-    """
+class LocalFusionGraph(FusionRule):
+    """The estimator; parameters are those of `FusionRule`."""
 
     removes, additive = True, True
-
-    def __init__(
-        self,
-        ledger: Ledger,
-        sources: Sequence[int],
-        *,
-        shared: bool = False,
-        relabellings: Sequence[tuple[int, ...]] | None = None,
-    ) -> None:
-        self.ledger, self.sources, self.shared = ledger, tuple(sources), shared
-        self.relabellings = relabellings or [tuple(range(len(self.sources)))]
 
     def start(self) -> State:
         """Everyone's initial estimate; a shared one is a common ancestor of all."""

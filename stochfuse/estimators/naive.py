@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from stochfuse.estimators import Late, best_relabelling
-from stochfuse.information import COMMON, Ledger
+from stochfuse.estimators import FusionRule, Late, best_relabelling
+from stochfuse.information import COMMON
 
 
 class State(NamedTuple):
@@ -22,21 +22,10 @@ class State(NamedTuple):
     late: tuple[tuple[int, int, int], ...] = ()
 
 
-class NaiveFusion:
-    """The estimator; parameters are those of `LocalFusionGraph`.  A shared start is not recognised as such."""
+class NaiveFusion(FusionRule):
+    """The estimator; parameters are those of `FusionRule`.  A shared start is not recognised as such."""
 
     removes, additive = False, True
-
-    def __init__(
-        self,
-        ledger: Ledger,
-        sources: Sequence[int],
-        *,
-        shared: bool = False,
-        relabellings: Sequence[tuple[int, ...]] | None = None,
-    ) -> None:
-        self.ledger, self.sources, self.shared = ledger, tuple(sources), shared
-        self.relabellings = relabellings or [tuple(range(len(self.sources)))]
 
     def start(self) -> State:
         """Everyone's initial estimate."""

@@ -11,9 +11,9 @@ and is what it truly achieves.  A received node brings the measurements of its w
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from stochfuse.estimators import Late, best_relabelling
+from stochfuse.estimators import FusionRule, Late, best_relabelling
 from stochfuse.information import COMMON, Ledger
 
 Held = tuple[int, ...]
@@ -27,21 +27,13 @@ class State(NamedTuple):
     late: tuple[tuple[int, int, Held], ...] = ()
 
 
-class OptimalFusion:
-    """The estimator; parameters are those of `LocalFusionGraph`."""
+class OptimalFusion(FusionRule):
+    """The estimator; parameters are those of `FusionRule`."""
 
     removes, additive = True, False
 
-    def __init__(
-        self,
-        ledger: Ledger,
-        sources: Sequence[int],
-        *,
-        shared: bool = False,
-        relabellings: Sequence[tuple[int, ...]] | None = None,
-    ) -> None:
-        self.ledger, self.sources, self.shared = ledger, tuple(sources), shared
-        self.relabellings = relabellings or [tuple(range(len(self.sources)))]
+    def __init__(self, ledger: Ledger, sources: Sequence[int], **more: Any) -> None:
+        super().__init__(ledger, sources, **more)
         self._values: dict[Held, int] = {}
 
     def start(self) -> State:

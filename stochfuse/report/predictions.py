@@ -167,8 +167,8 @@ class View:
         if p.sampled is not None:
             return f"sampled, {p.sampled.runs:,} runs, seed {p.meta['seed']}; ± one standard error"
         if p.method == "optimal":
-            paths = counted(p.meta["paths"], "path")
-            return f"exact, {paths}" if p.nature == "exact" else f"enclosed in bounds, {paths}"
+            nature = "exact" if p.nature == "exact" else "enclosed in proved bounds"
+            return nature if p.meta["paths"] is None else f"{nature}, {counted(p.meta['paths'], 'path')}"
         if p.outcomes is None:
             return "approximate (mean field)"
         everything = counted(p.meta["outcomes"], "outcome")
