@@ -268,7 +268,10 @@ def test_too_many_unlike_agents_are_refused_with_the_number():
         ({"link": "high"}, "link: expected link probabilities"),
         ({"link": []}, "link"),
         ({"method": "guess"}, "method: expected one of simplified, general, optimal, naive, monte-carlo, got 'guess'"),
-        ({"quantity": "hope"}, "quantity: expected one of claimed, actual, optimal, consistency, bias, rms, got 'hope'"),
+        (
+            {"quantity": "hope"},
+            "quantity: expected one of claimed, actual, optimal, consistency, bias, rms, got 'hope'",
+        ),
     ],
 )
 def test_bad_requests(arguments, message):

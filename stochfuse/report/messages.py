@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from stochfuse import __version__
-from stochfuse.messages import IDENTITY_BYTES, NUMBER_BYTES, Accuracy, Bytes, MessageLoad, Moments, Row, in_bytes
+from stochfuse.messages import IDENTITY_BYTES, NUMBER_BYTES, Accuracy, Bytes, MessageLoad, in_bytes
 from stochfuse.metrics import Metric
 from stochfuse.report.export import write_file
 from stochfuse.report.plot import MARKERS, figure_class, spread
@@ -281,24 +281,6 @@ def load_json(view: LoadView) -> dict[str, Any]:
         "scenario": first.scenario.to_mapping(),
         "meta": {"description": list(view.titles), "agent": view.agent, "header_bytes": view.header or 0},
     }
-
-
-def table_3_table(rows: Sequence[Row]) -> Table:
-    """Return table 3 of the thesis beside ours, see `stochfuse.messages.table_3`."""
-    titles = (
-        "Thesis table 3: Local Fusion Graph message size in nodes, 3 agents; mean, standard deviation, maximum",
-        "thesis: sampled, 1000 runs, maximum of those; ours: exact, by architecture and steps, maximum possible",
-        "the thesis states steps 6-10, its maxima need 12 steps; its ad hoc column has the moments of a broadcast draw",
-    )
-    cells = []
-    for row in rows:
-        ours = [(f"ours, {name}, {first}-{last}", m) for (name, first, last), m in row.ours.items()]
-        cells += [(row.column, f"{row.link:g}", who, *_moments(m)) for who, m in [("thesis", row.thesis), *ours]]
-    return Table(titles, ("column", "µ", "from"), ("mean", "std", "max"), tuple(cells))
-
-
-def _moments(moments: Moments) -> tuple[str, str, str]:
-    return f"{moments.mean:.3f}", f"{moments.std:.3f}", str(moments.maximum)
 
 
 def plot_load(view: LoadView, output: Path) -> None:

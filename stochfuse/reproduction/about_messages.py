@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from stochfuse import messages
+from stochfuse.reproduction import message_table
 from stochfuse.reproduction.bench import ARCHITECTURES, LINKS, NAIVE, STATED_WINDOW, WINDOW, Bench
 from stochfuse.reproduction.compared import mean_size
 from stochfuse.reproduction.statements import Statement, Verdict, explained, figures, judged, listed
@@ -43,7 +43,7 @@ def _quick_increase(bench: Bench) -> Verdict:
 
 
 def _larger_peaks(bench: Bench) -> Verdict:
-    rows = bench.once(("table-3",), messages.table_3)
+    rows = bench.once(("table-3",), message_table.table_3)
     found = {a: [r.ours[a, *WINDOW].std for r in rows if r.column == a][CELLS] for a in ARCHITECTURES}
     ours = "; ".join(f"{a.replace('-', ' ')} {listed(values)}" for a, values in found.items())
     ours += f" (standard deviation at 25, 50, 75 %).  The largest that is possible is {2 * WINDOW[1]} at each: that "
@@ -53,13 +53,13 @@ def _larger_peaks(bench: Bench) -> Verdict:
 
 def _cells(bench: Bench, column: str, draw: str, window: tuple[int, int]) -> np.ndarray:
     """Relative distance, in per cent, of our mean and deviation from the thesis', (3 levels, 2)."""
-    rows = [r for r in bench.once(("table-3",), messages.table_3) if r.column == column][CELLS]
+    rows = [r for r in bench.once(("table-3",), message_table.table_3) if r.column == column][CELLS]
     ours = np.array([[m.mean, m.std] for m in (r.ours[draw, *window] for r in rows)])
     return 100 * (ours / np.array([[r.thesis.mean, r.thesis.std] for r in rows]) - 1)
 
 
 def _stated_window(bench: Bench) -> Verdict:
-    rows = bench.once(("table-3",), messages.table_3)
+    rows = bench.once(("table-3",), message_table.table_3)
     largest = max(r.thesis.maximum for r in rows)
     stated, needed = (np.abs(_cells(bench, "broadcast", "broadcast", w)).max() for w in (STATED_WINDOW, WINDOW))
     possible = 2 * STATED_WINDOW[1]

@@ -26,8 +26,9 @@ from stochfuse.engines import Progress
 from stochfuse.engines.enumeration import Ending, claimed
 from stochfuse.events import bernstein, relabellings
 from stochfuse.general import Outcomes, outcomes
-from stochfuse.messages import WINDOWS, MessageLoad, message_load
+from stochfuse.messages import MessageLoad, message_load
 from stochfuse.methods import predict
+from stochfuse.reproduction.message_table import WINDOWS
 from stochfuse.scenario import Scenario, link_rows, load_scenario
 from stochfuse.states import predict_states
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stochfuse import messages
 from stochfuse.report.reproductions import Curve, Panel
+from stochfuse.reproduction import message_table
 from stochfuse.reproduction.bench import LINKS, STEADY, TRANSIENT, Bench
 from stochfuse.reproduction.figures import over_links
 from stochfuse.scenario import Scenario
@@ -13,7 +13,7 @@ from stochfuse.scenario import Scenario
 
 def table_3(bench: Bench) -> tuple[Panel, ...]:
     """Table 3 beside the exact calculation, for the window it needs and the one it states; a panel per column."""
-    rows = bench.once(("table-3",), messages.table_3)
+    rows = bench.once(("table-3",), message_table.table_3)
     panels = []
     for column in dict.fromkeys(row.column for row in rows):
         here = [row for row in rows if row.column == column]
