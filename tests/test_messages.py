@@ -19,7 +19,6 @@ from typer.testing import CliRunner
 import stochfuse as sf
 from stochfuse.cli.app import app
 from stochfuse.messages import (
-    TABLE_3,
     accuracy,
     in_bytes,
     like_agents,
@@ -29,7 +28,7 @@ from stochfuse.messages import (
 from stochfuse.metrics import metric
 from stochfuse.network import uniform_rows
 from stochfuse.report import messages as reports
-from stochfuse.reproduction.message_table import table_3
+from stochfuse.reproduction.message_table import TABLE_3, table_3
 from stochfuse.scenario import link_rows
 from tests.strategies import probabilities
 from tests.textbook import histories
