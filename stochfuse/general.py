@@ -32,17 +32,7 @@ from stochfuse.errors import StochfuseError, UsageError
 from stochfuse.estimators.local_fusion_graph import LocalFusionGraph
 from stochfuse.estimators.naive import NaiveFusion
 from stochfuse.estimators.optimal import OptimalFusion
-from stochfuse.events import (
-    MOST_AGENTS_RELABELLED,
-    Rows,
-    bernstein,
-    bursty,
-    events,
-    monomials,
-    orbits,
-    relabellings,
-    weights_for,
-)
+from stochfuse.events import MOST_AGENTS_RELABELLED, events, orbits, relabellings
 from stochfuse.information import Information, Ledger, evaluate
 from stochfuse.kalman import Estimate
 from stochfuse.metrics import Metric
@@ -50,6 +40,7 @@ from stochfuse.network import LinkRows, Network, number_of_senders
 from stochfuse.quantities import Moments, linear, matrix, value
 from stochfuse.scenario import Scenario
 from stochfuse.sources import error_sources, moments, sources_of
+from stochfuse.weights import Rows, bernstein, bursty, monomials, weights_for
 
 MOST_PROBABILITIES = 20_000_000
 """Probabilities that a distribution may hold at a time."""

@@ -23,12 +23,13 @@ from sympy.polys.fields import field
 from stochfuse.algebra import FIELD
 from stochfuse.engines.enumeration import Request, TooManyError, enumerate_outcomes
 from stochfuse.errors import UsageError
-from stochfuse.events import Counts, events, orbits, relabellings
+from stochfuse.events import events, orbits, relabellings
 from stochfuse.general import ESTIMATORS, check_size
 from stochfuse.information import Information, Ledger, Sources, evaluate_exactly
 from stochfuse.model import Model, Sensor
 from stochfuse.network import Network, uniform_rows
 from stochfuse.symbolic import MU, P0, Q, R, exact_number
+from stochfuse.weights import Counts
 
 MOST_OUTCOMES = 2_000_000
 """Outcomes of the last exchanges, over all graphs, up to which they are gone through one by one."""

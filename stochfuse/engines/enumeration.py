@@ -26,9 +26,10 @@ import numpy as np
 from stochfuse.engines import Progress, uncollected
 from stochfuse.errors import UsageError
 from stochfuse.estimators import Estimator
-from stochfuse.events import Event, Outcome, Rows, Weights, concerning, fates, outcomes
+from stochfuse.events import Event, Outcome, concerning, fates, outcomes
 from stochfuse.information import Information, check_definite
 from stochfuse.kalman import Estimate, from_information
+from stochfuse.weights import Rows, Weights
 
 MOST_GENERATORS = 6
 """Agents up to which truth tables of the lattice fit 64 bits."""

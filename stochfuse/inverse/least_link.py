@@ -26,7 +26,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.errors import NoAnswerError
-from stochfuse.events import bernstein
 from stochfuse.inverse.crossings import SECTIONS, intervals, lowest, scanned, separated
 from stochfuse.inverse.question import (
     SLACK,
@@ -40,6 +39,7 @@ from stochfuse.inverse.question import (
 from stochfuse.inverse.refinement import WANTED, refinable, refined
 from stochfuse.prediction import Prediction
 from stochfuse.scenario import Scenario
+from stochfuse.weights import bernstein
 
 BESIDE = 1e-9
 """How far beside the answer its neighbours are evaluated."""

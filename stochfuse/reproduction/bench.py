@@ -24,13 +24,14 @@ import numpy as np
 
 from stochfuse.engines import Progress
 from stochfuse.engines.enumeration import Ending, claimed
-from stochfuse.events import bernstein, relabellings
+from stochfuse.events import relabellings
 from stochfuse.general import Outcomes, outcomes
 from stochfuse.messages import MessageLoad, message_load
 from stochfuse.methods import predict
 from stochfuse.reproduction.message_table import WINDOWS
 from stochfuse.scenario import Scenario, link_rows, load_scenario
 from stochfuse.states import predict_states
+from stochfuse.weights import bernstein
 
 LINKS = (0.0, 0.25, 0.5, 0.75, 1.0)
 ARCHITECTURES = ("ad-hoc", "broadcast", "cyclic")
