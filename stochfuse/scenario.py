@@ -26,15 +26,8 @@ from stochfuse.checks import Checker, shown
 from stochfuse.errors import Problem, ScenarioError, UsageError
 from stochfuse.metrics import metric as metric_of
 from stochfuse.model import Model, Sensor
-from stochfuse.network import (
-    ARCHITECTURES,
-    LinkRows,
-    Network,
-    default_rows,
-    mean_delivery,
-    stacked_rows,
-    uniform_rows,
-)
+from stochfuse.network import LinkRows, Network, default_rows, stacked_rows, uniform_rows
+from stochfuse.scenario_tables import read_link, read_model, read_network, read_sensors
 
 SCHEMA = "stochfuse.scenario/1"
 DEFAULT = "thesis-transient"
@@ -162,7 +155,7 @@ def link_rows(scenario: Scenario, link: Any = None) -> LinkRows:
         check.note("link", "probabilities between 0 and 1", f"{array.min() if array.min() < 0 else array.max():g}")
     elif array is not None and array.ndim == 3 and array.size:
         matrices = [
-            _link(check, "link", matrix, network.agents, network.steps, network.architecture) for matrix in array
+            read_link(check, "link", matrix, network.agents, network.steps, network.architecture) for matrix in array
         ]
         if not check.problems:
             return stacked_rows(None, [m for m in matrices if m is not None], network)
@@ -263,11 +256,11 @@ def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> S
     tables = {
         key: mapping[key] if isinstance(mapping.get(key), dict) else {} for key in ("model", "initial", "network")
     }
-    network = _network(check, tables["network"])
+    network = read_network(check, tables["network"])
     steps = network.steps if network else 1
-    model, default = _model(check, tables["model"], steps)
+    model, default = read_model(check, tables["model"], steps)
     d = model.dimension if model else None
-    sensors, sensor_of = _sensors(check, mapping.get("agent"), default, d, network)
+    sensors, sensor_of = read_sensors(check, mapping.get("agent"), default, d, network)
     initial = tables["initial"]
     P0 = check.covariance("initial.P", initial.get("P"), d, 0)
     correlation = check.choice("initial.correlation", initial.get("correlation", "independent"), CORRELATIONS)
@@ -298,178 +291,3 @@ def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> S
         metric=metric,
         source={key: value for key, value in mapping.items() if key != "schema"},
     )
-
-
-def _network(check: Checker, table: Mapping[str, Any]) -> Network | None:
-    agents = check.integer("network.agents", table.get("agents"), 1)
-    steps = check.integer("network.steps", table.get("steps"), 1)
-    architecture = check.choice("network.architecture", table.get("architecture", "ad-hoc"), ARCHITECTURES)
-    if agents is None or steps is None or architecture is None:
-        if isinstance(table.get("link"), int | float):
-            check.link("network.link", table["link"], 1, 1)
-        return None
-    link = _link(check, "network.link", table.get("link"), agents, steps, architecture)
-    burst = _burst(check, "network", table)
-    link = link if burst is None else mean_delivery(burst)
-    cases, bursts = [], []
-    for i, case in enumerate(table.get("case") or [], start=1):
-        if not isinstance(case, dict):
-            continue
-        path = f"network.case[{i}].link"
-        own = link if case.get("link") is None else _link(check, path, case["link"], agents, steps, architecture)
-        bursty = burst if case.get("link") is None else None
-        if case.get("burst") is not None:
-            bursty = _burst(check, f"network.case[{i}]", case)
-            own = own if bursty is None else mean_delivery(bursty)
-        name = str(case.get("name", i))
-        check.name(f"network.case[{i}].name", name)
-        if name in [other for other, _ in cases]:
-            check.note(f"network.case[{i}].name", "a name of its own", shown(name))
-        if own is None and case.get("link") is None and case.get("burst") is None:
-            check.note(path, "a link probability here or in network.link", "nothing")
-        elif own is not None:
-            cases.append((name, own))
-            bursts.append(bursty)
-    delay = _delay(check, table.get("delay"))
-    return Network(agents, steps, architecture, link, tuple(cases), delay, burst, tuple(bursts))
-
-
-def _burst(check: Checker, path: str, table: Mapping[str, Any]) -> np.ndarray | None:
-    given = table.get("burst")
-    if not isinstance(given, dict):
-        return None
-    path = f"{path}.burst"
-    if table.get("link") is not None:
-        check.note(path, "either a link probability or a burst", "both")
-    keys = {"good_to_bad": None, "bad_to_good": None, "good": 1.0, "bad": 0.0}
-    values = []
-    for key, default in keys.items():
-        value = given.get(key, default)
-        if value is None:
-            check.note(f"{path}.{key}", "a probability", "nothing")
-            continue
-        number = check.array(f"{path}.{key}", value, "a probability")
-        if number is not None and (number.ndim or not 0 <= number <= 1):
-            check.note(f"{path}.{key}", "a probability", shown(value))
-        elif number is not None:
-            values.append(float(number))
-    if len(values) < len(keys):
-        return None
-    if values[0] + values[1] == 0:
-        check.note(path, "good_to_bad or bad_to_good above 0, so that the share of good steps is known", "0 for both")
-        return None
-    return np.array(values)
-
-
-def _link(check: Checker, path: str, value: Any, agents: int, steps: int, architecture: str) -> np.ndarray | None:
-    link = check.link(path, value, agents, steps)
-    _check_broadcast(check, path, link, agents, architecture)
-    return link
-
-
-def _check_broadcast(check: Checker, path: str, link: np.ndarray | None, agents: int, architecture: str) -> None:
-    if link is not None and link.ndim >= 2 and architecture == "broadcast":
-        others = np.where(np.eye(agents, dtype=bool), np.nan, link)
-        with np.errstate(invalid="ignore"):
-            uneven = agents > 2 and (np.nanmax(others, axis=-2) != np.nanmin(others, axis=-2)).any()
-        if uneven:
-            check.note(
-                path, "equal probabilities in each column (a broadcast is heard by all or by none)", "unequal ones"
-            )
-
-
-def _delay(check: Checker, value: Any) -> tuple[float, ...]:
-    array = check.array("network.delay", value, "a number of steps or a list of probabilities")
-    if array is None:
-        return (1.0,)
-    if array.ndim == 0:
-        if array < 0 or array != int(array):
-            check.note(
-                "network.delay", "a whole number of steps, or the probabilities of 0, 1, 2 … steps", shown(value)
-            )
-            return (1.0,)
-        return (0.0,) * int(array) + (1.0,)
-    if array.ndim != 1 or not array.size or (array < 0).any() or abs(array.sum() - 1) > 1e-9:
-        check.note("network.delay", "probabilities of 0, 1, 2 … steps that sum to 1", shown(value))
-        return (1.0,)
-    return tuple(array.tolist())
-
-
-def _model(check: Checker, table: Mapping[str, Any], steps: int) -> tuple[Model | None, Sensor | None]:
-    F = check.matrix("model.F", table.get("F"), None, None, steps)
-    if F is not None and F.shape[-1] != F.shape[-2]:
-        check.note("model.F", "a square matrix", f"a {F.shape[-2]}×{F.shape[-1]} matrix")
-        F = None
-    d = None if F is None else F.shape[-1]
-    G = check.matrix("model.G", table.get("G"), d, None, steps, identity=True)
-    noises = G.shape[-1] if G is not None else None if table.get("G") is not None else d
-    Q = check.covariance("model.Q", table.get("Q"), noises, steps)
-    B = check.matrix("model.B", table.get("B"), d, None, steps)
-    u = check.vector("model.u", table.get("u"), None if B is None else B.shape[-1], steps)
-    if table.get("u") is not None and table.get("B") is None:
-        check.note("model.B", "an input matrix, since model.u is given", "nothing")
-    states = _names(check, "model.states", table.get("states"), d)
-    units = _names(check, "model.units", table.get("units"), d)
-    default = _sensor(check, "model", table, d, steps, None)
-    if F is None or Q is None or d is None:
-        return None, default
-    model = Model(
-        F=F,
-        Q=Q if G is None else G @ Q @ np.swapaxes(G, -1, -2),
-        Bu=np.zeros((d, 1)) if B is None or u is None else B @ u,
-        states=states or tuple("x" if d == 1 else f"x{i}" for i in range(1, d + 1)),
-        units=units or ("",) * d,
-    )
-    return model, default
-
-
-def _names(check: Checker, path: str, value: Any, d: int | None) -> tuple[str, ...] | None:
-    if not isinstance(value, list) or d is None:
-        return None
-    if len(value) != d:
-        check.note(path, f"{d} names, one per state", f"{len(value)}")
-    elif path.endswith("states") and len(set(value)) < d:
-        check.note(path, "different names", shown(value))
-    for i, name in enumerate(value, start=1):
-        check.name(f"{path}[{i}]", str(name), of_state=path.endswith("states"))
-    return tuple(map(str, value))
-
-
-def _sensor(
-    check: Checker, path: str, table: Mapping[str, Any], d: int | None, steps: int, default: Sensor | None
-) -> Sensor | None:
-    if table.get("H") is None and default is not None:
-        H = default.H
-    else:
-        H = check.matrix(f"{path}.H", table.get("H"), None, d, steps)
-    if table.get("R") is None and default is not None:
-        R = default.R
-        if H is not None and R.shape[-1] != H.shape[-2]:
-            check.note(f"{path}.R", f"a {H.shape[-2]}×{H.shape[-2]} matrix, to go with its own H", "nothing")
-    else:
-        R = check.covariance(f"{path}.R", table.get("R"), None if H is None else H.shape[-2], steps, definite=True)
-    return None if H is None or R is None else Sensor(H, R)
-
-
-def _sensors(
-    check: Checker, agents: Any, default: Sensor | None, d: int | None, network: Network | None
-) -> tuple[tuple[Sensor, ...], tuple[int, ...]]:
-    if network is None or default is None:
-        return (), ()
-    if not agents:
-        return (default,), (0,) * network.agents
-    if len(agents) != network.agents:
-        check.note("agent", f"one [[agent]] table for each of the {network.agents} agents", f"{len(agents)}")
-        return (), ()
-    different: dict[tuple[Any, ...], int] = {}
-    sensors, sensor_of = [], []
-    for i, table in enumerate(agents, start=1):
-        sensor = _sensor(check, f"agent[{i}]", table if isinstance(table, dict) else {}, d, network.steps, default)
-        if sensor is None:
-            continue
-        key = (sensor.H.shape, sensor.H.tobytes(), sensor.R.shape, sensor.R.tobytes())
-        if key not in different:
-            different[key] = len(sensors)
-            sensors.append(sensor)
-        sensor_of.append(different[key])
-    return tuple(sensors), tuple(sensor_of)
