@@ -234,6 +234,11 @@ def update_factor(
     return L * left[..., None, :]
 
 
+def posterior_gain(L: np.ndarray, H: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """Kalman gain K = P HᵀR⁻¹ from the factor of the posterior P = L Lᵀ, shape (..., d, p), for precise sensors."""
+    return L @ (np.swapaxes(L, -1, -2) @ np.swapaxes(np.linalg.solve(R, H), -1, -2))
+
+
 def _show_exactly(turned: np.ndarray, L: np.ndarray, sigma: np.ndarray) -> None:
     """Take out of L, in place, what rounding left of it in measured directions where Uᵀ C⁻¹H L should be 0.
 

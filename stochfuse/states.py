@@ -23,7 +23,7 @@ from stochfuse import simplified
 from stochfuse.arrivals import Arrivals
 from stochfuse.engines.mean_field import Case
 from stochfuse.errors import UsageError
-from stochfuse.kalman import Estimate, factor, predict, to_information, update, update_factor
+from stochfuse.kalman import Estimate, factor, posterior_gain, predict, to_information, update, update_factor
 from stochfuse.model import Sensor, at_step
 from stochfuse.network import LinkRows, possible_senders
 from stochfuse.scenario import Scenario, link_rows
@@ -203,10 +203,10 @@ def _over_subsets(
         inside = np.isin(places, subset)
         x, L = prior.x, start
         for j in (own, *senders[inside]):
-            # one measurement after the other, with the gain P HᵀR⁻¹ of the posterior: precise sensors lose nothing
+            # one measurement after the other, so that precise sensors lose nothing
             H, R = sensors[j]
             L = update_factor(L, H, R)
-            x = x + L @ (np.swapaxes(L, -1, -2) @ np.linalg.solve(R, H).T @ (z[j][:, None] - H @ x))
+            x = x + posterior_gain(L, H, R) @ (z[j][:, None] - H @ x)
         total = total + np.where(inside, heard, 1.0 - heard).prod(axis=1)[:, None, None] * x
     return total
 

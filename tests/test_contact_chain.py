@@ -13,6 +13,7 @@ from stochfuse.engines import contact_chain, enclosure
 from stochfuse.engines.contacts import number_of_paths
 from stochfuse.network import Network
 from tests import strategies, textbook
+from tests.test_accuracy import CASES
 
 PUBLISHED = {
     ("ad-hoc", 0.25): (77.083, 39.984, 32.577, 30.779, 30.335),
@@ -176,6 +177,34 @@ def test_the_enclosure_holds_the_exact_value(architecture, link, monkeypatch):
     assert enclosed.nature == "bound"
     assert (bound < 1e-6).all()
     assert (np.abs(enclosed.values() / exact.values() - 1) <= bound * (1 + 1e-9) + 1e-14).all()
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_precise_sensors_and_vague_starts(case):
+    """Where nothing is left to chance the optimum is the Kalman filter's, here in 60 digits."""
+    scenario = sf.Scenario.from_mapping(strategies.mapping(*CASES[case], agents=3, steps=4))
+    got = sf.predict(scenario, [0.0, 1.0], "optimal").covariance
+    for P, link in zip(got, (0.0, 1.0), strict=True):
+        assert textbook.scaled_error(P, textbook.simplified_mpmath(*CASES[case], 3, link, 4)) < 1e-9
+
+
+def test_redundant_sensors_of_a_scalar():
+    scenario = sf.Scenario.from_mapping(strategies.mapping(1, 1e12, [[1], [1]], [[1e-4, 0], [0, 1e-4]], 1e12, 3, 3))
+    np.testing.assert_allclose(sf.predict(scenario, [0.0, 1.0], "optimal").values()[:, 2], [5e-5, 5e-5 / 3], rtol=1e-12)
+
+
+def test_pruned_bursts():
+    """A hidden state that cannot be does not count as a row that must keep an outcome."""
+    burst = {"good_to_bad": 0.0, "bad_to_good": 0.5, "good": 0.9, "bad": 0.0}
+    source = strategies.mapping(1, 1, 1, 1, 4, 3, 4, architecture="broadcast", burst=burst)
+    scenario = sf.Scenario.from_mapping(source)
+    exact = sf.predict(scenario, method="general")
+    pruned = sf.predict(scenario, method="general", prune=True, max_graphs=20)
+    kept = 1 - np.array(pruned.meta["left_out"])
+    assert 0 < 1 - kept.min() < 0.2
+    low = exact.values() - (1 - kept) * exact.values()[:, :1]  # what is left out claims between 0 and P(k0)
+    assert (pruned.values() * kept >= low).all()
+    assert (pruned.values() * kept <= exact.values() + 1e-12).all()
 
 
 def test_many_agents_and_steps():

@@ -635,3 +635,14 @@ def test_binomial_counts_are_what_the_closed_form_says():
     µ, n = 0.3, 5
     direct = sum(comb(n - 1, m) * µ**m * (1 - µ) ** (n - 1 - m) / (m + 1) for m in range(n))
     assert direct == pytest.approx((1 - (1 - µ) ** n) / (n * µ), rel=1e-14)
+
+
+@pytest.mark.parametrize("agent", ["worst", "best"])
+def test_sensitivity_of_the_worst_agent_where_all_are_equal_and_links_perfect(agent):
+    scenario, h = sf.load_scenario(steps=2), 1e-6
+    found = sensitivity(scenario, 1.0, method="general", agent=agent)
+    for (sender, (receiver,)), slope in zip(found.links, found.derivative, strict=True):
+        link = np.ones((3, 3))
+        link[receiver - 1, sender - 1] -= h
+        below = sf.predict(scenario, link[None], "general").values(agent=agent)[0, -1]
+        assert slope == pytest.approx((found.value - below) / h, rel=1e-4, abs=1e-4)

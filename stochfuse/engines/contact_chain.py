@@ -26,13 +26,33 @@ import numpy as np
 
 from stochfuse.engines.contacts import Contacts
 from stochfuse.errors import UsageError
-from stochfuse.kalman import Estimate, predict, update
+from stochfuse.kalman import (
+    Estimate,
+    factor,
+    from_factor,
+    posterior_gain,
+    predict,
+    predict_factor,
+    update,
+    update_factor,
+)
 from stochfuse.model import Model, Sensor, at_step
 
 MOST_PATHS = 20_000
 """Paths up to which they are gone through one by one."""
 MOST_NUMBERS = 20_000_000
 """Transition probabilities, or weights of paths, that are held at a time."""
+
+
+class Carried(NamedTuple):
+    """What is left of the initial error, (..., d, 1), and the covariance: its square root for several components.
+
+    A covariance of several components would lose the digits of precise sensors to the subtraction in its update.  The
+    error is None where it is not asked for.
+    """
+
+    x: Any
+    root: np.ndarray
 
 
 class Filter(NamedTuple):
@@ -53,24 +73,42 @@ class Filter(NamedTuple):
     shared: bool
     error: np.ndarray | None = None
 
-    def start(self, counts: np.ndarray) -> Estimate:
+    def start(self, counts: np.ndarray) -> Carried:
         """Estimate from so many agents' initial ones, and what it leaves of the error."""
         x = np.zeros((len(self.P0), 1)) if self.error is None else self.error
-        return Estimate(x[None], (self.P0 if self.shared else self.P0 / counts.sum())[None])
+        P = (self.P0 if self.shared else self.P0 / counts.sum())[None]
+        return Carried(x[None], P if self.scalar else factor(P))
 
-    def after(self, estimate: Estimate, counts: np.ndarray, step: int) -> Estimate:
+    def after(self, before: Carried, counts: np.ndarray, step: int) -> Carried:
         """Predict to a step and take in the measurements of so many agents of each kind; of errors, if there are.
 
         Of one kind, the numbers may be a stack (..., 1) that goes with the estimate's.
         """
-        model = self.model
-        estimate = predict(estimate, at_step(model.F, step), at_step(model.Q, step))
-        for sensor, count in zip(self.sensors, np.moveaxis(counts, -1, 0), strict=True):
-            if count.any():
-                H, R = at_step(sensor.H, step), at_step(sensor.R, step)
-                z = None if estimate.x is None else np.zeros((len(H), 1))
-                estimate = update(estimate, H, R / count[..., None, None], z)
-        return estimate
+        F, Q = at_step(self.model.F, step), at_step(self.model.Q, step)
+        sensors = [(at_step(sensor.H, step), at_step(sensor.R, step)) for sensor in self.sensors]
+        arrived = [(H, R, n) for (H, R), n in zip(sensors, np.moveaxis(counts, -1, 0), strict=True) if n.any()]
+        if self.scalar:
+            estimate = predict(Estimate(*before), F, Q)
+            for H, R, n in arrived:
+                J = H.T @ np.linalg.solve(R, H)  # all that a measurement of a scalar says, whatever its size
+                if J.any():
+                    estimate = update(estimate, np.ones((1, 1)), 1.0 / (J * n[..., None, None]), np.zeros((1, 1)))
+            return Carried(*estimate)
+        x, L = before.x, predict_factor(before.root, F, factor(Q))
+        x = x if x is None else F @ x
+        for H, R, n in arrived:
+            L = update_factor(L, H, R, lambda s: 1.0 / (1.0 + n[..., None] * s))  # noqa: B023
+            x = x if x is None else x - posterior_gain(L, H, R / n[..., None, None]) @ (H @ x)
+        return Carried(x, L)
+
+    def covariance(self, carried: Carried) -> np.ndarray:
+        """Covariance of what is carried."""
+        return carried.root if self.scalar else from_factor(carried.root)
+
+    @property
+    def scalar(self) -> bool:
+        """Whether the state has one component."""
+        return self.model.dimension == 1
 
 
 class Chain(NamedTuple):
@@ -97,9 +135,9 @@ class TooManyPathsError(UsageError):
 
 
 class Class(NamedTuple):
-    """Paths that end with the same counts: estimate after each, and weight (rows, states of those counts, paths)."""
+    """Paths that end with the same counts: what each carries, and weight (rows, states of those counts, paths)."""
 
-    estimate: Estimate
+    carried: Carried
     weight: np.ndarray
 
 
@@ -153,22 +191,21 @@ def _paths(given: Filter, contacts: Contacts, steps: int, some: slice) -> tuple[
         else:
             classes = _grown(given, classes, before, counts, states, step)
         paths = sum(c.weight.shape[2] for c in classes.values())
-        for place, moment in enumerate(_closed(classes, T, states, contacts.starts)):
+        for place, moment in enumerate(_closed(given, classes, T, states, contacts.starts)):
             out[place].append(moment)
         before = T
     return [np.stack(moment, axis=1) for moment in out], paths
 
 
 def _closed(
-    classes: dict[int, Class], T: np.ndarray, states: list[np.ndarray], starts: Sequence[int]
+    given: Filter, classes: dict[int, Class], T: np.ndarray, states: list[np.ndarray], starts: Sequence[int]
 ) -> tuple[Any, Any, Any]:
     """E[P], E[b] and E[P + b bᵀ] over the paths, each (rows, groups, …)."""
     P, b, M = 0.0, 0.0, 0.0
-    for c, (estimate, weight) in classes.items():
+    for c, (carried, weight) in classes.items():
         last = T[:, list(starts)][:, :, states[c]] @ weight  # (rows, groups, paths)
-        square = estimate.P + estimate.x @ np.swapaxes(estimate.x, -1, -2)
-        x = np.broadcast_to(estimate.x, (*estimate.P.shape[:-1], 1))
-        P, b, M = P + _over(last, estimate.P), b + _over(last, x), M + _over(last, square)
+        x, now = carried.x, given.covariance(carried)
+        P, b, M = P + _over(last, now), b + _over(last, x), M + _over(last, now + x @ np.swapaxes(x, -1, -2))
     return P, b, M
 
 
@@ -189,20 +226,19 @@ def _grown(
     for c, here in enumerate(states):
         parents, weights = [], []
         rows_here = T[:, here]
-        for before, (estimate, weight) in classes.items():
+        for before, (carried, weight) in classes.items():
             block = rows_here[:, :, states[before]]
             if not block.any():
                 continue
             new = block @ weight
             alive = np.flatnonzero(new.any(axis=(0, 1)))
             if len(alive):
-                x = np.broadcast_to(estimate.x, (*estimate.P.shape[:-1], 1))
-                parents.append(Estimate(x[alive], estimate.P[alive]))
+                parents.append(Carried(carried.x[alive], carried.root[alive]))
                 weights.append(new[:, :, alive])
         if parents:
-            together = Estimate(*map(np.concatenate, zip(*parents, strict=True)))
+            together = Carried(*map(np.concatenate, zip(*parents, strict=True)))
             grown[c] = Class(given.after(together, counts[c], step), np.concatenate(weights, axis=2))
-            paths += len(together.P)
+            paths += len(together.x)
             check_size(paths, sum(g.weight.size for g in grown.values()))
     return grown
 

@@ -23,6 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stochfuse.engines.contact_chain import (
+    Carried,
     Chain,
     Filter,
     blocks_of_rows,
@@ -31,7 +32,7 @@ from stochfuse.engines.contact_chain import (
     transitions,
 )
 from stochfuse.engines.contacts import Contacts
-from stochfuse.kalman import Estimate, factor
+from stochfuse.kalman import factor, from_factor
 
 GRID = 800
 """Grid cells over the range of P."""
@@ -72,14 +73,14 @@ def _on_a_grid(given: Filter, contacts: Contacts, steps: int, some: slice) -> tu
         out = np.empty(np.broadcast_shapes(P.shape, (len(contacts.held), 1)))
         P = np.broadcast_to(P, out.shape)[..., None, None]
         if counts.shape[1] == 1:
-            return given.after(Estimate(None, P), contacts.held[:, None], step).P[..., 0, 0]
+            return given.after(Carried(None, P), contacts.held[:, None], step).root[..., 0, 0]
         for count, here in zip(counts, states, strict=True):
-            out[..., here, :] = given.after(Estimate(None, P[..., here, :, :, :]), count, step).P[..., 0, 0]
+            out[..., here, :] = given.after(Carried(None, P[..., here, :, :, :]), count, step).root[..., 0, 0]
         return out
 
     start = np.empty(len(contacts.held))
     for count, here in zip(counts, states, strict=True):
-        start[here] = given.start(count).P.item()
+        start[here] = given.covariance(given.start(count)).item()
     nodes = _nodes(start, after, steps)
     shape = (len(range(*some.indices(some.stop))), len(start), len(nodes))
     low = _split(nodes, np.broadcast_to(start[:, None], (*shape[:2], 1)), np.ones((*shape[:2], 1)))
@@ -90,7 +91,7 @@ def _on_a_grid(given: Filter, contacts: Contacts, steps: int, some: slice) -> tu
     at_nodes = np.empty(0)
     for step, T in enumerate(transitions(contacts, steps, some), start=1):
         if step > 1:
-            low, mass, moment = (_flushed(before @ M) for M in (low, mass, moment))
+            low, mass, moment = np.split(_flushed(before @ np.concatenate([low, mass, moment], axis=2)), 3, axis=2)
             at_nodes = at_nodes if constant and at_nodes.size else np.broadcast_to(after(nodes, step), shape)
             mean = np.divide(moment, mass, out=np.broadcast_to(nodes, shape).copy(), where=mass > 0)
             low = _split(nodes, at_nodes, low)
@@ -153,13 +154,13 @@ def _by_last_counts(given: Filter, contacts: Contacts, steps: int, some: slice) 
     for step, T in enumerate(transitions(contacts, steps, some), start=1):
         if step == 1:
             for c in range(n):
-                P = given.start(counts[c]).P
-                classes[c] = _Merged(np.array([[c]]), P, P, np.ones((len(T), len(states[c]), 1)))
+                L = given.start(counts[c]).root
+                classes[c] = _Merged(np.array([[c]]), L, L, np.ones((len(T), len(states[c]), 1)))
         else:
             classes = _grown(given, classes, before, counts, states, step, window)
         last = {c: T[:, list(contacts.starts)][:, :, states[c]] @ merged.weight for c, merged in classes.items()}
-        lower.append(sum(np.tensordot(last[c], merged.low, axes=1) for c, merged in classes.items()))
-        upper.append(sum(np.tensordot(last[c], merged.high, axes=1) for c, merged in classes.items()))
+        lower.append(sum(np.tensordot(last[c], from_factor(merged.low), axes=1) for c, merged in classes.items()))
+        upper.append(sum(np.tensordot(last[c], from_factor(merged.high), axes=1) for c, merged in classes.items()))
         before = T
     return np.stack(lower, axis=1), np.stack(upper, axis=1)
 
@@ -170,7 +171,7 @@ class _Merged(NamedTuple):
     Parameters
     ----------
     last : (paths, window) last counts, as numbers of classes.
-    low, high : (paths, d, d) smallest and largest covariance.
+    low, high : (paths, d, d) square roots of the smallest and the largest covariance.
     weight : (rows, states, paths).
     """
 
@@ -207,7 +208,7 @@ def _grown(
             kept = last[order][:, -window:]
             first = np.flatnonzero(np.concatenate([[True], (np.diff(kept, axis=0) != 0).any(axis=1)]))
             end = np.append(first[1:], len(kept)) - 1
-            low = given.after(Estimate(None, np.concatenate(lows)[order[end]]), counts[c], step).P
-            high = given.after(Estimate(None, np.concatenate(highs)[order[first]]), counts[c], step).P
+            low = given.after(Carried(None, np.concatenate(lows)[order[end]]), counts[c], step).root
+            high = given.after(Carried(None, np.concatenate(highs)[order[first]]), counts[c], step).root
             grown[c] = _Merged(kept[first], low, high, np.add.reduceat(weight[:, :, order], first, axis=2))
     return grown

@@ -175,7 +175,7 @@ def _enumerate(estimator: Estimator, request: Request, progress: Progress) -> St
             layer = _next_layer(estimator, layer, possible, step - 1, request, progress)
             layer = dict(zip(layer, weights.between(list(layer.values())), strict=True)) if weights.memory else layer
             if request.prune and len(layer) > request.most:
-                layer = _likeliest(layer, request.most)
+                layer = _likeliest(layer, request)
             _check_size(len(layer), number[steps], request)
             sizes.append(len(layer))
         if not two_steps:
@@ -209,9 +209,10 @@ def _next_layer(
     return found
 
 
-def _likeliest(layer: dict[Any, np.ndarray], most: int) -> dict[Any, np.ndarray]:
+def _likeliest(layer: dict[Any, np.ndarray], request: Request) -> dict[Any, np.ndarray]:
     """Return the likeliest states, every row's own likeliest in turn."""
-    states, weights = list(layer), np.array(list(layer.values()))
+    most, states = request.most, list(layer)
+    weights = request.weights.collected(np.array(list(layer.values())).T).T
     rank = np.argsort(np.argsort(-weights, axis=0, kind="stable"), axis=0, kind="stable").min(axis=1)
     kept = np.sort(np.argsort(rank, kind="stable")[:most])
     if (weights[kept].sum(axis=0) <= 0).any():

@@ -50,7 +50,7 @@ class Sensitivity:
     question : what was asked about.
     links : sender and receivers of every link, numbered from 1.
     link : (links,) its probability.
-    derivative : (links,) dE/dµ; one-sided at 0 and 1.
+    derivative : (links,) dE/dµ; one-sided at 0 and 1, and to the right where several agents are the worst (or best).
     error : (links,) estimated error of the derivative; a derivative no larger than that is given as 0.
     exact : whether E is a polynomial whose derivative is exact to rounding.
     value : E at the links as they are.
@@ -200,8 +200,9 @@ def _slope(f: np.ndarray, x: float, a: float, length: float, agent: int | str, e
         whole, short = series.deriv()(x), series.truncate(degree + 1 - SPARE).deriv()(x)
         slopes.append(short if exact else whole)
         errors.append(abs(whole - short))
-    # of several agents that are the worst, all must get better for the worst to get better
-    return float(min(slopes) if agent == "best" else max(slopes)), float(max(errors))
+    # of several agents that are the worst, all must get better for the worst to get better; at µ = 1 one looks back
+    least = (agent == "best") != (x == 1.0)
+    return float(min(slopes) if least else max(slopes)), float(max(errors))
 
 
 @dataclass(frozen=True, eq=False)
