@@ -83,6 +83,8 @@ def compare(
         choose("methods", method, METHODS)
     if len(set(methods)) < len(methods):
         raise UsageError(f"methods: expected different ones, got {', '.join(methods)}")
+    if quantity == "optimal" and len(methods) > 1:
+        raise UsageError("quantity: expected one that depends on the method; the optimum is the same for all")
     if reference is None:
         reference = min(methods, key=EXACT_FIRST.index)
     elif reference not in methods:

@@ -266,7 +266,7 @@ def accuracy(
     link: Any = None,
     *,
     metric: Any = "trace",
-    quantity: str = "claimed",
+    quantity: str = "actual",
     agent: int | str = "mean",
     method: str = "exact",
     **settings: Any,

@@ -49,6 +49,7 @@ class Settings:
     progress: Any = None
 
 
+NAIVE = "naive fusion counts shared information again and believes it; quantity actual is its true error"
 NO_ERROR = "the scenario has no known initial error (initial.error): the bias is 0, the RMS error that of the noise"
 
 
@@ -148,8 +149,12 @@ def predict_several(
     """Predict several quantities, with no more work than the hardest of them needs; see `predict`."""
     apart = [q for q in quantities if q == "optimal" and method != "optimal"]
     together = [q for q in quantities if q not in apart]
-    # the moments of the actual error contain what is claimed
-    hardest = max(together, key=lambda q: q not in ("claimed", "optimal"), default=None)
+    if method == "optimal" and {"claimed", "optimal"} <= set(together):
+        raise UsageError(
+            "quantity: with method optimal the claimed covariance is the optimal one; expected one of them"
+        )
+    # the moments of the actual error contain what is claimed; bias and rms have more to note
+    hardest = max(together, key=("claimed", "optimal", "actual", "consistency", "bias", "rms").index, default=None)
     found = {q: predict(scenario, link, method, q, **settings) for q in apart}
     if hardest is not None:
         common = predict(scenario, link, method, hardest, **settings)
@@ -191,7 +196,7 @@ def _enumerated(scenario: Scenario, rows: LinkRows, how: Settings, estimator: st
         progress=how.progress,
     )
     left_out = float(found.left_out.max())
-    notes = []
+    notes = [] if errors or estimator != "naive" else [NAIVE]
     if left_out > 1e-12:
         row, step = np.unravel_index(found.left_out.argmax(), found.left_out.shape)
         notes.append(

@@ -153,3 +153,27 @@ def test_bursty_links_are_not_asked_backwards(tmp_path):
     path.write_text(json.dumps(mapping(1, 25, 1, 100, 100, 2, 3, burst=BURST)))
     for question in (["--target", "30"], ["--sensitivity"], ["--gain"]):
         assert "network.burst: expected links without memory" in run("solve", str(path), *question, code=2).stderr
+
+
+def test_what_is_the_same_is_not_shown_twice(tmp_path):
+    error = run("predict", "--method", "optimal", "--quantity", "claimed,optimal", code=2).stderr
+    assert "quantity: with method optimal the claimed covariance is the optimal one; expected one of them" in error
+    error = run("compare", "--quantity", "optimal", code=2).stderr
+    assert "quantity: expected one that depends on the method; the optimum is the same for all" in error
+
+
+def test_titles_say_what_µ_does_not(tmp_path):
+    for network, text in (
+        ({"burst": BURST}, "ad-hoc, bursty links; "),
+        ({"link": 0.5, "delay": [0.5, 0.5]}, "ad-hoc, delays; "),
+    ):
+        path = tmp_path / "network.json"
+        path.write_text(json.dumps(mapping(1, 25, 1, 100, 100, 2, 2, **network)))
+        assert text in run("predict", str(path), "--method", "optimal").stdout
+
+
+def test_notes_do_not_depend_on_the_order():
+    for quantities in ("bias,actual", "actual,bias"):
+        done = run("predict", "thesis-steady", "--method", "general", "--steps", "2", "--quantity", quantities)
+        assert "the scenario has no known initial error (initial.error)" in done.stderr
+    assert "quantity actual is its true error" in run("predict", "--method", "naive", "--steps", "2").stderr

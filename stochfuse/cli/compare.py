@@ -22,7 +22,6 @@ from stochfuse.cli.options import (
     PlotOption,
     PruneOption,
     QOption,
-    QuantityOption,
     ROption,
     RunsOption,
     ScenarioArgument,
@@ -53,7 +52,9 @@ def compare(
     p0: P0Option = None,
     architecture: ArchitectureOption = None,
     estimator: EstimatorOption = None,
-    quantity: QuantityOption = "claimed",
+    quantity: Annotated[
+        str, typer.Option(metavar="NAME", help="claimed, actual, consistency (actual / claimed), bias or rms.")
+    ] = "claimed",
     metric: MetricOption = None,
     agent: AgentOption = "mean",
     relative: Annotated[bool, typer.Option("--relative", help="Differences in per cent of the reference.")] = False,

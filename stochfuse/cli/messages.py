@@ -77,7 +77,8 @@ def messages(
     ] = False,
     metric: MetricOption = None,
     quantity: Annotated[
-        str | None, typer.Option(metavar="NAME", help="--accuracy: which covariance; default: claimed.")
+        str | None,
+        typer.Option(metavar="NAME", help="--accuracy: claimed, actual, consistency, bias or rms; default: actual."),
     ] = None,
     bytes: Annotated[bool, typer.Option("--bytes", help="Bytes too, from the scenario's state dimension.")] = False,
     header: Annotated[
@@ -134,7 +135,7 @@ def messages(
             each,
             links,
             metric=chosen,
-            quantity=quantity or "claimed",
+            quantity=quantity or "actual",
             agent=whose,
             method=method.value,
             **sampling,

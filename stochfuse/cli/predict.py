@@ -96,12 +96,15 @@ def predict(
     from stochfuse.errors import UsageError
     from stochfuse.methods import predict_several as run
     from stochfuse.metrics import metric as metric_of
+    from stochfuse.quantities import check
     from stochfuse.report.predictions import View
 
     check_files(output, plot, scenario)
     quantities = quantity_names(quantity)
     given, links = load(scenario, agents, steps, architecture, q, r, p0, link)
     chosen = metric_of(metric or given.metric or "trace", given.model)
+    for name in quantities:
+        check(name, chosen)
     if statistic != "mean":
         if method not in (Method.general, Method.naive):
             raise UsageError(f"--statistic {statistic}: expected --method general or naive, got {method.value}")

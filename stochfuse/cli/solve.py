@@ -75,7 +75,9 @@ def solve(
         Method, typer.Option(help="How to average over which messages arrive (monte-carlo cannot be asked backwards).")
     ] = Method.simplified,
     estimator: EstimatorOption = None,
-    quantity: Annotated[str, typer.Option(metavar="NAME", help="Which quantity, as in predict.")] = "claimed",
+    quantity: Annotated[
+        str, typer.Option(metavar="NAME", help="claimed, actual, optimal, consistency, bias or rms.")
+    ] = "claimed",
     metric: MetricOption = None,
     agent: AgentOption = "mean",
     max_graphs: MaxGraphsOption = None,
@@ -189,6 +191,12 @@ def _single(links: list[float] | None, kind: str) -> float:
 
 
 def _note(sheet: Sheet) -> None:
+    if sheet.kind == "sensitivity" and sheet.question.method == "simplified" and sheet.question.agent != "mean":
+        typer.echo(
+            "note: the simplified formulation lets an agent's prior stand for the others' too, so that only links to "
+            "the agent count; see --method general or optimal",
+            err=True,
+        )
     for note in sheet.prediction.notes:
         typer.echo(f"note: {note}", err=True)
     if sheet.question.metric.mixed:

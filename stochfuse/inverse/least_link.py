@@ -166,9 +166,10 @@ def _unreachable(asked: Question, target: float, curve: Curve, cells: np.ndarray
     if curve.proof != "monotone":
         best = lowest(curve.value, points[max(i - 1, 0)], points[min(i + 1, len(points) - 1)])
     value = float(curve.value(np.array([best]))[0])
+    digits = 9 if f"{value:.9g}" != f"{target:.9g}" else 17
     return (
-        f"{described(asked)} is {value:.9g} at best, at µ = {best:.6g}; expected a target of at least that, "
-        f"got {target:.9g}"
+        f"{described(asked)} is {value:.{digits}g} at best, at µ = {best:.6g}; expected a target of at least that, "
+        f"got {target:.{digits}g}"
     )
 
 

@@ -124,8 +124,8 @@ def question(
         )
     chosen = metric(of or scenario.metric or "trace", scenario.model)
     at = None if steady else step or last
-    if quantity == "optimal":
-        method = "optimal"  # the optimum is the same whatever the method
+    if quantity == "optimal" or (method, quantity) == ("optimal", "claimed"):
+        method = quantity = "optimal"  # the optimum is the same whatever the method
     return Question(scenario.until(at or 1), at, chosen, agent, method, quantity, settings)
 
 

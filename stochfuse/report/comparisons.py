@@ -198,7 +198,7 @@ def draw(view: ComparisonView):
                 bars = 1.96 * along(errors, c) * scale
                 right.errorbar(x, along(differences[m], c), bars, color=color, capsize=2, **style)
     unit = f" [{first.unit}]" if first.unit else ""
-    left.set_ylabel(first.noun.partition(" (")[0] + unit)
+    left.set_ylabel(first.axis)
     if values.min() >= 0:
         left.set_ylim(bottom=0)
     right.axhline(0, color="0.3", linewidth=0.8)
@@ -209,8 +209,16 @@ def draw(view: ComparisonView):
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.grid(alpha=0.3)
     methods = [
-        Line2D([], [], color="0.2", linestyle=styles[m % 4], marker=MARKERS[m], markersize=4, label=method)
-        for m, method in enumerate(view.comparison.methods)
+        Line2D(
+            [],
+            [],
+            color="0.2",
+            linestyle=styles[m % 4],
+            marker=MARKERS[m],
+            markersize=4,
+            label=f"{q.method}, {q.nature}",
+        )
+        for m, q in enumerate(view.comparison.predictions)
     ]
     steps = [Line2D([], [], color=color, linewidth=3, label=names[c]) for c, color in zip(chosen, colors, strict=True)]
     left.legend(handles=[*methods, *steps], fontsize="small", ncols=2)

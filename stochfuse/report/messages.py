@@ -154,7 +154,7 @@ def load_table(view: LoadView) -> Table:
             columns += [f"{short} mean B", f"{short} max B"]
             cells += [_numbers(size.mean, None, view.digits), size.maximum.astype(str).tolist()]
         if accuracy is not None:
-            columns.append(f"{short} accuracy")
+            columns.append(f"{short} {accuracy.prediction.quantity}")
             cells.append(_numbers(accuracy.values, accuracy.error, view.digits))
     first = view.loads[0]
     keys = [(f"{µ:.6g}",) if first.cases is None else (first.cases[i], f"{µ:.4g}") for i, µ in enumerate(first.link)]
@@ -375,7 +375,6 @@ def _draw_accuracy(view: LoadView, axes: Any) -> None:
                 names[i], (load[i], accuracy.values[i]), xytext=(4, 4), textcoords="offset points", fontsize=7
             )
     shown = view.accuracy_view(view.accuracies[0])
-    unit = f" [{shown.unit}]" if shown.unit else ""
     bars = "; bars: at least 95 % confidence" if view.accuracies[0].error is not None else ""
     axes.set_xlabel(f"mean nodes per step (marks: link probability µ{bars})")
-    axes.set_ylabel(shown.metric.label.partition(" (")[0] + unit)
+    axes.set_ylabel(shown.axis)

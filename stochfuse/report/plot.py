@@ -70,10 +70,8 @@ def draw(view: View):
         against_link = p.cases is None and len(p.link) > 1
         bars = [1.96 * (errors[order, i] if against_link else errors[i]) for i in chosen]
     _draw_curves(axes, curves, bars)
-    short = {"bias": "bias of ", "rms": "RMS error of ", "consistency": "actual / claimed, "}.get(p.quantity, "")
-    short += view.noun.partition(" (")[0]
     if view.statistic == "mean":
-        axes.set_ylabel(short + (f" [{view.unit}]" if view.unit else ", relative to µ = 0" if view.baseline else ""))
+        axes.set_ylabel(view.axis)
     else:
         axes.set_ylabel("\n".join(wrap(view.what.partition(": ")[2].partition(" [no unit")[0], 45)))
     if values.min() >= 0:

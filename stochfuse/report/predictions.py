@@ -111,7 +111,7 @@ class View:
         if by is None:
             return values
         if (by == 0).any():
-            raise UsageError(f"{self.metric.label} is 0 at link probability 0 and cannot be normalised to it")
+            raise UsageError(f"{self.full_noun} is 0 at link probability 0 and cannot be normalised to it")
         return values / by
 
     @property
@@ -126,7 +126,7 @@ class View:
         else:
             kind, number = parse_statistic(self.statistic)
             own = unit_of(p.quantity, self.metric)
-            text = STATISTICS[kind].format(what=self.noun, number=f"{number:.12g}", unit=f" {own}" if own else "")
+            text = STATISTICS[kind].format(what=self.full_noun, number=f"{number:.12g}", unit=f" {own}" if own else "")
             heading, unit = title(p.quantity, p.stage), "" if kind == "at-most" else unit
         return f"{heading[0].upper()}{heading[1:]}: {text}{unit}"
 
@@ -136,11 +136,30 @@ class View:
         return noun(self.prediction.quantity, self.metric)
 
     @property
+    def full_noun(self) -> str:
+        """What is shown where the quantity is not named beside it."""
+        before = {"bias": "bias of ", "rms": "RMS error of ", "consistency": "actual / claimed, "}
+        return before.get(self.prediction.quantity, "") + self.noun
+
+    @property
+    def axis(self) -> str:
+        """Label of an axis along which the values lie."""
+        unit = f" [{self.unit}]" if self.unit else ", relative to µ = 0" if self.baseline else ""
+        return self.full_noun.partition(" (")[0] + unit
+
+    @property
     def whom(self) -> str:
         """One line: the scenario and whose covariance."""
         scenario = self.prediction.scenario
         n = scenario.network.agents
-        return f"{scenario.name}: {n} agent{'s' * (n > 1)}, {scenario.network.architecture}; {self._of}"
+        return f"{scenario.name}: {n} agent{'s' * (n > 1)}, {scenario.network.architecture}{self._links}; {self._of}"
+
+    @property
+    def _links(self) -> str:
+        """What the µ of a row does not say of the links."""
+        network = self.prediction.scenario.network
+        bursty = network.burst is not None or any(burst is not None for burst in network.case_bursts)
+        return ", bursty links" * bursty + ", delays" * (network.delay != (1.0,))
 
     @property
     def _of(self) -> str:

@@ -105,13 +105,11 @@ def draw(views: Sequence[View]):
     curves = [Line2D([], [], color=color, linewidth=3, label=names[c]) for c, color in zip(chosen, colors, strict=True)]
     panels[units[0]].legend(handles=[*quantities, *curves], fontsize="small", ncols=2)
     sampled = "; bars: 95 % confidence" if p.sampled is not None else ""
-    figure.suptitle("\n".join([views[0].whom, *wrap(views[0].how + sampled, 50 * len(units) + 30)]), fontsize="medium")
+    how = [line for view in dict.fromkeys(v.how for v in views) for line in wrap(view + sampled, 50 * len(units) + 30)]
+    what = f"expected {p.stage} covariances and errors"
+    figure.suptitle("\n".join([f"{views[0].whom}; {what}", *how]), fontsize="medium")
     return figure
 
 
 def _axis(view: View) -> str:
-    quantity = view.prediction.quantity
-    if quantity == "consistency":
-        return RATIO
-    unit = f" [{view.unit}]" if view.unit else ""
-    return {"bias": "bias of ", "rms": "RMS error of "}.get(quantity, "") + view.noun.partition(" (")[0] + unit
+    return RATIO if view.prediction.quantity == "consistency" else view.axis

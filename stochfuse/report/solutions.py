@@ -276,7 +276,8 @@ def gain_sheet(found: ShareOfGain, digits: int = 5) -> Sheet:
     if p.cases is None and len(half) and np.isfinite(found.share[half[0]]).all():
         first, last = np.min(found.share[half[0]]), np.max(found.share[half[0]])
         span = f"{100 * first:.3g}" + (f" to {100 * last:.3g}" if len(steps) > 1 else "")
-        answer.append(f"At µ = 0.5 it is {span} % (the thesis: about 70 %)")
+        thesis = " (the thesis, of the Local Fusion Graph: about 70 %)" if p.scenario.name == "thesis-transient" else ""
+        answer.append(f"At µ = 0.5 it is {span} %{thesis}")
     rows, records = [], []
     for i, µ in enumerate(p.link):
         name = () if p.cases is None else (p.cases[i],)

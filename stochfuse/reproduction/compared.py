@@ -27,12 +27,15 @@ from stochfuse.reproduction.figures import (
     Make,
     averaged_errors,
     errors_of_records,
+    one_record,
     over_links,
     percent,
 )
 
 MOST_NODES = 10
 """Message sizes that the thesis' axes show."""
+BOTH_NOISE = "averaged over links and noise; Local Fusion Graph exact, simplified approximate"
+BOTH_ONE = ONE + "; Local Fusion Graph exact, simplified approximate"
 
 
 def histogram(architecture: str) -> Make:
@@ -103,7 +106,7 @@ def cost_of_accuracy(case: Case) -> Make:
         y = f"RMS error (actual), mean over steps 2–{bench.steps}"
         return tuple(
             Panel(title, "mean message size [nodes]", y, tuple(map(percent, LINKS)), np.array(LINKS), tuple(curves))
-            for title, curves in ((NOISE, averaged), (ONE.format(bench.seed), single))
+            for title, curves in ((NOISE, averaged), (one_record(bench), single))
         )
 
     return make
@@ -157,7 +160,7 @@ def relative_errors(bench: Bench, *, one_record: bool) -> dict[tuple[str, str], 
 def figure_71(bench: Bench) -> tuple[Panel, ...]:
     """Figure 71: relative RMS errors of both methods."""
     panels = []
-    for title, one in ((NOISE, False), (ONE.format(bench.seed), True)):
+    for title, one in ((BOTH_NOISE, False), (BOTH_ONE.format(bench.seed, ""), True)):
         found = relative_errors(bench, one_record=one)
         curves = [Curve(f"{RULES[rule]}, {case}", y) for (case, rule), y in found.items()]
         panels.append(over_links(f"ad hoc, {title}", f"RMS error, mean over steps 2–{bench.steps}, / 0 %", curves))
@@ -167,7 +170,7 @@ def figure_71(bench: Bench) -> tuple[Panel, ...]:
 def figure_72(bench: Bench) -> tuple[Panel, ...]:
     """Figure 72: their difference."""
     panels = []
-    for title, one in ((NOISE, False), (ONE.format(bench.seed), True)):
+    for title, one in ((BOTH_NOISE, False), (BOTH_ONE.format(bench.seed, ""), True)):
         found = relative_errors(bench, one_record=one)
         curves = [Curve(c.name, found[c.name, SIMPLIFIED] - found[c.name, LFG]) for c in (TRANSIENT, STEADY)]
         panels.append(over_links(f"ad hoc, {title}", "simplified less Local Fusion Graph, both / 0 %", curves))

@@ -24,9 +24,15 @@ FEW = 20
 """Records whose spread is shown."""
 RULES = {LFG: "Local Fusion Graph", NAIVE: "naive fusion", SIMPLIFIED: "simplified (53)/(54)"}
 CONNECTIVITY = "average connectivity"
-ONE = "given one record of truth and measurements (seed {}, record 1), averaged over links as the thesis does, exact"
+ONE = "given one record of truth and measurements (seed {}, record 1), averaged over links as the thesis does{}"
 NOISE = "averaged over links and noise, exact"
+APPROXIMATELY = "averaged over links and noise, approximate"
 Make = Callable[[Bench], tuple[Panel, ...]]
+
+
+def one_record(bench: Bench, *, exact: bool = True) -> str:
+    """Title of what is given one record."""
+    return ONE.format(bench.seed, ", exact" if exact else ", approximate")
 
 
 def percent(link: float) -> str:
@@ -89,9 +95,10 @@ def states(case: Case, architecture: str, rules: Sequence[str] = (LFG,)) -> Make
             weights = bench.weights(case, architecture, rule=rule)
             true = records.truth(scenario, drawn)[0]
             expected = np.full(bench.steps, records.TRUTH)
+            exact = rule != SIMPLIFIED
             for title, x, error in (
-                (NOISE, expected, weights.first[..., -1]),
-                (ONE.format(bench.seed), true, weights.mean_given(drawn)[0]),
+                (NOISE if exact else APPROXIMATELY, expected, weights.first[..., -1]),
+                (one_record(bench, exact=exact), true, weights.mean_given(drawn)[0]),
             ):
                 curves = [Curve("true state", x), *per_link(x + error)]
                 panels.append(over_steps(bench, f"{RULES[rule]}, {title}", "mean state estimate", curves))
@@ -109,7 +116,7 @@ def errors(case: Case, architecture: str) -> Make:
         y = "RMS error (actual)"
         return (
             over_steps(bench, f"Local Fusion Graph, {NOISE}", y, per_link(weights.rms(records.spread(scenario)))),
-            over_steps(bench, f"Local Fusion Graph, {ONE.format(bench.seed)}", y, per_link(one)),
+            over_steps(bench, f"Local Fusion Graph, {one_record(bench)}", y, per_link(one)),
         )
 
     return make
@@ -157,7 +164,7 @@ def averaged_over_time(
         single = [(n, errors_of_records(bench, w, c, a, FEW)) for n, c, a, w in found]
         panels = [
             over_links(NOISE, y, [Curve(n, averaged_errors(bench, w, c, a)) for n, c, a, w in found], links),
-            over_links(ONE.format(bench.seed), y, [Curve(n, e[0]) for n, e in single], links),
+            over_links(one_record(bench), y, [Curve(n, e[0]) for n, e in single], links),
             over_links(
                 f"{FEW} single records: median, lowest and highest",
                 "change of that RMS error against 0 %, in per cent of it",
