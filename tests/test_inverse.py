@@ -551,9 +551,7 @@ def test_other_questions_on_the_command_line():
     assert (rows[0]["nature"], rows[0]["unit"]) == ("approximate", "m")
     table = solve("--sensitivity", "--link", "0.5").stdout
     assert "No link is better to improve than another: +0.01 on any one" in table
-    assert (
-        "At µ = 0.5 it is 62.5 to 66.3 % (the thesis" in solve("--gain").stdout
-    )
+    assert "At µ = 0.5 it is 62.5 to 66.3 % (the thesis" in solve("--gain").stdout
     steady = in_json("--steady", "--link", "0,1")
     assert steady["values"] == pytest.approx(sf.steady_state(sf.load_scenario(), [0, 1]).P.ravel().tolist())
     assert max(steady["relative_bound"]) <= 1e-11
