@@ -37,7 +37,7 @@ from stochfuse.information import Information, Ledger, evaluate
 from stochfuse.kalman import Estimate
 from stochfuse.metrics import Metric
 from stochfuse.network import LinkRows, Network, number_of_senders
-from stochfuse.quantities import Moments, linear, matrix, value
+from stochfuse.quantities import Moments, linear, matrix, number, value
 from stochfuse.scenario import Scenario
 from stochfuse.sources import error_sources, moments, sources_of
 from stochfuse.weights import Rows, bernstein, bursty, monomials, weights_for
@@ -181,16 +181,16 @@ class Outcomes:
         UsageError
             If there is no such statistic, or it cannot be had of this metric.
         """
-        kind, number = check_statistic(name, quantity, metric)
+        kind, argument = check_statistic(name, quantity, metric)
         share = [len(self.groups[g]) for g in groups]
         if kind == "derivative":
             slope = np.average(self.derivative(quantity)[:, :, groups], axis=2, weights=share)
-            return value(quantity, metric, Moments(*[slope] * 4))
+            return number(quantity, metric, slope)
         of: dict[str, Callable[[Distribution], np.ndarray]] = {
             "variance": Distribution.variance,
             "std": lambda spread: np.sqrt(spread.variance()),
-            "quantile": lambda spread: spread.quantile(number),
-            "at-most": lambda spread: spread.at_most(number),
+            "quantile": lambda spread: spread.quantile(argument),
+            "at-most": lambda spread: spread.at_most(argument),
         }
         return self.over_outcomes(metric, groups, of[kind], quantity)
 

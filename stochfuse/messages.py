@@ -26,12 +26,12 @@ from stochfuse.engines.message_sampling import frequencies, sampled_loads
 from stochfuse.engines.message_walk import like_agents, naive_load, walked_load
 from stochfuse.errors import UsageError
 from stochfuse.events import events
+from stochfuse.methods import RUNS, SEED, choose, predict
 from stochfuse.network import LinkRows, require_memoryless
 from stochfuse.scenario import Scenario, link_rows
 
 RULES = ("local-fusion-graph", "naive")
 METHODS = ("exact", "monte-carlo")
-RUNS, SEED = 1000, 1
 NUMBER_BYTES, IDENTITY_BYTES = 8, 8
 
 
@@ -167,9 +167,8 @@ def message_load(
     UsageError
         If the request does not fit the scenario, or the exact walk has too many states.
     """
-    for name, value, choices in (("rule", rule, RULES), ("method", method, METHODS)):
-        if value not in choices:
-            raise UsageError(f"{name}: expected one of {', '.join(choices)}, got '{value}'")
+    choose("rule", rule, RULES)
+    choose("method", method, METHODS)
     for name, value, least in (("runs", runs, 2), ("seed", seed, 0)):
         if value < least:
             raise UsageError(f"{name}: expected a whole number of at least {least}, got {value}")
@@ -281,8 +280,6 @@ def accuracy(
     method : "exact": general formulation (49) of the rule; or "monte-carlo".
     **settings : of `stochfuse.predict`.
     """
-    from stochfuse.methods import predict
-
     scenario, last = load.scenario, int(load.steps[-1])
     if method == "exact":
         how = "naive" if load.rule == "naive" else "general"

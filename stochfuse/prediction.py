@@ -10,7 +10,7 @@ import numpy as np
 
 from stochfuse.errors import UsageError
 from stochfuse.metrics import Metric, metric
-from stochfuse.quantities import Moments, linear, matrix, value
+from stochfuse.quantities import Moments, linear, matrix, number, value
 from stochfuse.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -146,7 +146,7 @@ class Prediction:
         by_step = []
         for k in self.steps:
             each = [self.outcomes.coefficients(int(k), g, self.quantity) for g in groups]
-            by_step.append(value(self.quantity, of, Moments(*[np.average(each, axis=0, weights=share)] * 4)))
+            by_step.append(number(self.quantity, of, np.average(each, axis=0, weights=share)))
         return by_step
 
     def standard_error(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray | None:

@@ -72,10 +72,14 @@ def value(quantity: str, metric: Metric, moments: Moments) -> np.ndarray:
         If the quantity cannot be had of the metric.
     """
     check(quantity, metric)
-    m = matrix(quantity, moments)
     if quantity == "consistency":
-        claimed, actual = metric.of(moments.P), metric.of(m)
+        claimed, actual = metric.of(moments.P), metric.of(moments.actual)
         return np.divide(actual, claimed, out=np.ones_like(actual), where=claimed != 0)
+    return number(quantity, metric, matrix(quantity, moments))
+
+
+def number(quantity: str, metric: Metric, m: np.ndarray) -> np.ndarray:
+    """Return the same from the one moment behind a quantity, which consistency does not have."""
     if quantity == "bias":
         chosen = m[..., list(metric.states), 0]
         return chosen[..., 0] if len(metric.states) == 1 else np.sqrt((chosen**2).sum(axis=-1))

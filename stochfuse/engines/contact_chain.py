@@ -19,7 +19,7 @@ Where paths are too many, `stochfuse.engines.enclosure` gives bounds.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -162,6 +162,25 @@ def transitions(contacts: Contacts, steps: int, some: slice) -> Iterator[np.ndar
             T = contacts.transition(step + 1, some)
 
 
+def closing(T: np.ndarray, starts: Sequence[int], here: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Probability of every path that ends in some states, (rows, groups, paths), from its weight there."""
+    return T[:, list(starts)][:, :, here] @ weight
+
+
+def leading(
+    classes: Mapping[int, Any], T: np.ndarray, here: np.ndarray, states: Sequence[np.ndarray]
+) -> Iterator[tuple[Any, np.ndarray, np.ndarray]]:
+    """Classes of paths that may lead to the states here: the class, which of its paths do, and their weight here."""
+    rows_here = T[:, here]
+    for before, paths in classes.items():
+        block = rows_here[:, :, states[before]]
+        if block.any():
+            weight = block @ paths.weight
+            alive = np.flatnonzero(weight.any(axis=(0, 1)))
+            if len(alive):
+                yield paths, alive, weight[:, :, alive]
+
+
 def expected_optimum(given: Filter, contacts: Contacts, steps: int, rows: int) -> Chain:
     """Go through every path.
 
@@ -203,7 +222,7 @@ def _closed(
     """E[P], E[b] and E[P + b bᵀ] over the paths, each (rows, groups, …)."""
     P, b, M = 0.0, 0.0, 0.0
     for c, (carried, weight) in classes.items():
-        last = T[:, list(starts)][:, :, states[c]] @ weight  # (rows, groups, paths)
+        last = closing(T, starts, states[c], weight)
         x, now = carried.x, given.covariance(carried)
         P, b, M = P + _over(last, now), b + _over(last, x), M + _over(last, now + x @ np.swapaxes(x, -1, -2))
     return P, b, M
@@ -224,20 +243,14 @@ def _grown(
     """Every path with every count that may follow."""
     grown, paths = {}, 0
     for c, here in enumerate(states):
-        parents, weights = [], []
-        rows_here = T[:, here]
-        for before, (carried, weight) in classes.items():
-            block = rows_here[:, :, states[before]]
-            if not block.any():
-                continue
-            new = block @ weight
-            alive = np.flatnonzero(new.any(axis=(0, 1)))
-            if len(alive):
-                parents.append(Carried(carried.x[alive], carried.root[alive]))
-                weights.append(new[:, :, alive])
-        if parents:
-            together = Carried(*map(np.concatenate, zip(*parents, strict=True)))
-            grown[c] = Class(given.after(together, counts[c], step), np.concatenate(weights, axis=2))
+        parts = [
+            (before.carried.x[alive], before.carried.root[alive], weight)
+            for before, alive, weight in leading(classes, T, here, states)
+        ]
+        if parts:
+            x, root, weight = zip(*parts, strict=True)
+            together = Carried(np.concatenate(x), np.concatenate(root))
+            grown[c] = Class(given.after(together, counts[c], step), np.concatenate(weight, axis=2))
             paths += len(together.x)
             check_size(paths, sum(g.weight.size for g in grown.values()))
     return grown

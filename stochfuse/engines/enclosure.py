@@ -29,6 +29,8 @@ from stochfuse.engines.contact_chain import (
     blocks_of_rows,
     by_counts,
     check_size,
+    closing,
+    leading,
     transitions,
 )
 from stochfuse.engines.contacts import Contacts
@@ -158,7 +160,7 @@ def _by_last_counts(given: Filter, contacts: Contacts, steps: int, some: slice) 
                 classes[c] = _Merged(np.array([[c]]), L, L, np.ones((len(T), len(states[c]), 1)))
         else:
             classes = _grown(given, classes, before, counts, states, step, window)
-        last = {c: T[:, list(contacts.starts)][:, :, states[c]] @ merged.weight for c, merged in classes.items()}
+        last = {c: closing(T, contacts.starts, states[c], merged.weight) for c, merged in classes.items()}
         lower.append(sum(np.tensordot(last[c], from_factor(merged.low), axes=1) for c, merged in classes.items()))
         upper.append(sum(np.tensordot(last[c], from_factor(merged.high), axes=1) for c, merged in classes.items()))
         before = T
@@ -193,13 +195,10 @@ def _grown(
     """Every path with every count that may follow."""
     grown = {}
     for c, here in enumerate(states):
-        parts = []
-        for before, merged in classes.items():
-            weight = T[:, here][:, :, states[before]] @ merged.weight
-            alive = np.flatnonzero(weight.any(axis=(0, 1)))
-            if len(alive):
-                last = np.column_stack([merged.last[alive], np.full(len(alive), c)])
-                parts.append(_Merged(last, merged.low[alive], merged.high[alive], weight[:, :, alive]))
+        parts = [
+            (np.column_stack([m.last[alive], np.full(len(alive), c)]), m.low[alive], m.high[alive], weight)
+            for m, alive, weight in leading(classes, T, here, states)
+        ]
         if parts:
             lasts, lows, highs, weights = zip(*parts, strict=True)
             last, weight = np.concatenate(lasts), np.concatenate(weights, axis=2)
