@@ -199,7 +199,7 @@ class FusionGraph:
                 elif sent == step:
                     late.append(Late(receiver - 1, arrives - sent, sender - 1))
             for i in range(n):
-                self._fused[i + 1, step] = exchange.fused(i, heard[i])
+                self._fused[i + 1, step] = exchange.fused(i, heard)
             if step < history.steps:
                 exchange = exchange.onward(heard, late)
         self.pedigrees: Pedigrees = exchange.pedigrees

@@ -29,24 +29,21 @@ from stochfuse.engines.enumeration import (
     expectation,
 )
 from stochfuse.errors import StochfuseError, UsageError
-from stochfuse.estimators.local_fusion_graph import LocalFusionGraph
-from stochfuse.estimators.naive import NaiveFusion
-from stochfuse.estimators.optimal import OptimalFusion
+from stochfuse.estimators import Claims
 from stochfuse.events import MOST_AGENTS_RELABELLED, events, orbits, relabellings
-from stochfuse.information import Information, Ledger, evaluate
 from stochfuse.kalman import Estimate
 from stochfuse.metrics import Metric
 from stochfuse.network import LinkRows, Network, number_of_senders
 from stochfuse.quantities import Moments, linear, matrix, number, value
+from stochfuse.rules import make
 from stochfuse.scenario import Scenario
-from stochfuse.sources import error_sources, moments, sources_of
+from stochfuse.sources import moments
 from stochfuse.weights import Rows, bernstein, bursty, monomials, weights_for
 
 MOST_PROBABILITIES = 20_000_000
 """Probabilities that a distribution may hold at a time."""
 MOST_AGENTS, MOST_SENDERS = 40, 12
 """Agents, and agents that one of them may hear, up to which outcomes are listed."""
-ESTIMATORS = {"local-fusion-graph": LocalFusionGraph, "naive": NaiveFusion, "optimal": OptimalFusion}
 
 
 def itself(estimate: Estimate) -> Estimate:
@@ -63,7 +60,7 @@ class Outcomes:
     scenario, rows : what was given.
     groups : agents that are alike, as sorted tuples.
     structure : the outcomes.
-    values : information of every value in the structure.
+    values : numbers for every value in the structure.
     weights : bookkeeping of probabilities.
     of : what is averaged: the estimate itself, or the moments of its error (quantities other than claimed need them).
     """
@@ -72,7 +69,7 @@ class Outcomes:
     rows: LinkRows
     groups: tuple[tuple[int, ...], ...]
     structure: Structure
-    values: Information
+    values: Claims
     weights: Any
     of: Callable[[Estimate], Any] = itself
 
@@ -301,7 +298,7 @@ def outcomes(
     Parameters
     ----------
     rows : rows of link probabilities.
-    estimator : one of `ESTIMATORS`.
+    estimator : one of `stochfuse.methods.ESTIMATORS`.
     records : measurements (steps, agents, p) where states are wanted.
     errors : whether the moments of the actual error are wanted too; not with records.
     max_graphs : states that may be carried from step to step.
@@ -316,22 +313,18 @@ def outcomes(
     """
     network = scenario.network
     check_size(network)
-    everyone = tuple(range(network.agents))
-    # records tell like agents apart; footprints only say whose noise is whose
-    permutations = relabellings(network, rows, scenario.sensor_of if records is None else everyone)
-    labels = everyone if errors or records is not None else scenario.sensor_of
-    ledger = Ledger(scenario.sensor_of if errors else None)
+    # records tell like agents apart
+    kinds = scenario.kind_of if records is None else tuple(range(network.agents))
+    permutations = relabellings(network, rows, kinds)
     # a bursty link keeps its state where it is: nobody may change places
     fixed = plain or rows.bursts is not None
-    made = ESTIMATORS[estimator](
-        ledger, labels, shared=scenario.correlation == "shared", relabellings=None if fixed else permutations
-    )
+    made = make(scenario, estimator, None if fixed else permutations, errors=errors, records=records)
     per_step = [events(network, rows, step) for step in range(1, network.steps + 1)]
     if rows.bursts is not None:
         weights = bursty(per_step[0], len(rows.link))
     else:
         weights = Rows(len(rows.link)) if prune else weights_for(network, rows, sum(map(len, per_step)))
-    groups = groups_alike(network, rows, scenario.sensor_of if records is None else everyone, permutations)
+    groups = groups_alike(network, rows, kinds, permutations)
     request = Request(
         agents=network.agents,
         steps=network.steps,
@@ -343,10 +336,9 @@ def outcomes(
         prune=prune,
         plain=plain,
     )
-    sources = error_sources(scenario) if errors else sources_of(scenario, records)
-    structure = enumerate_outcomes(made, request, progress)
+    structure = enumerate_outcomes(made.estimator, request, progress)
     of = moments if errors else itself
-    return Outcomes(scenario, rows, groups, structure, evaluate(ledger, sources), weights, of)
+    return Outcomes(scenario, rows, groups, structure, made.claims(), weights, of)
 
 
 def groups_alike(

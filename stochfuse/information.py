@@ -23,6 +23,7 @@ import numpy as np
 from stochfuse.algebra import NUMPY, Algebra
 from stochfuse.errors import NoAnswerError, UsageError
 from stochfuse.kalman import (
+    Estimate,
     Information,
     from_information,
     predict,
@@ -240,6 +241,37 @@ def evaluate(ledger: Ledger, sources: Sources) -> Information:
     return _pair(values, d, states)
 
 
+class InformationClaims:
+    """What sums of information claim, see `stochfuse.estimators.Claims`.
+
+    Parameters
+    ----------
+    information : of every value of a ledger.
+    """
+
+    def __init__(self, information: Information) -> None:
+        d = information.Y.shape[-1]
+        self.information, y = information, information.y
+        self.width = d * max(d, 0 if y is None else y.shape[-1])
+        # the last entry, −1, stands for nothing
+        self._Y = np.concatenate([information.Y, np.zeros((1, d, d))])
+        self._y = None if y is None else np.concatenate([y, np.zeros_like(y[:1])])
+
+    def estimate(self, terms: Sequence[tuple[int, np.ndarray]], step: int) -> tuple[Estimate, float]:
+        """Estimates of a step from sums of values.
+
+        Raises
+        ------
+        NoAnswerError
+            If some sum is no positive-definite information.
+        """
+        Y: Any = sum(sign * self._Y[values] for sign, values in terms)
+        check_definite(Y, step)
+        y = None if self._y is None else sum(sign * self._y[values] for sign, values in terms)
+        estimate = from_information(Information(y, Y))
+        return estimate, float((_diagonal(estimate.P) * _diagonal(Y)).max())
+
+
 def evaluate_exactly(ledger: Ledger, sources: Sources) -> list[Information]:
     """Every value of a ledger over an exact field, one by one."""
     atoms: dict[int, Information] = {}
@@ -259,6 +291,10 @@ def evaluate_exactly(ledger: Ledger, sources: Sources) -> list[Information]:
             total = atoms[atom].Y * times + total
         values[value] = Information(None, total)
     return [values[value] for value in range(len(ledger.sums))]
+
+
+def _diagonal(A: np.ndarray) -> np.ndarray:
+    return np.diagonal(A, axis1=-2, axis2=-1)
 
 
 def _packed(information: Information) -> np.ndarray:

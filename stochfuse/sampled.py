@@ -18,12 +18,13 @@ from stochfuse.engines import Progress
 from stochfuse.engines.monte_carlo import Experiment, Sample, sample
 from stochfuse.errors import UsageError
 from stochfuse.events import events, relabellings
-from stochfuse.general import ESTIMATORS, groups_alike
+from stochfuse.general import groups_alike
 from stochfuse.metrics import Metric
 from stochfuse.network import LinkRows
 from stochfuse.quantities import Moments, value
+from stochfuse.rules import make
 from stochfuse.scenario import Scenario
-from stochfuse.sources import claimed_only, error_sources, moments, sources_of
+from stochfuse.sources import claimed_only, moments
 
 MOST_AGENTS, MOST_NUMBERS = 60, 500_000_000
 """Agents whose sets fit a machine word, and claimed values that a sample may hold."""
@@ -112,7 +113,7 @@ def sampled(
     for name, given, least in (("runs", runs, 2), ("seed", seed, 0), ("workers", 1 if workers is None else workers, 1)):
         if given < least:
             raise UsageError(f"{name}: expected a whole number of at least {least}, got {given}")
-    network, kinds = scenario.network, scenario.sensor_of
+    network, kinds = scenario.network, scenario.kind_of
     if network.agents > MOST_AGENTS:
         raise UsageError(f"method 'monte-carlo' takes at most {MOST_AGENTS} agents, got {network.agents}")
     numbers = runs * len(rows.link) * network.steps * network.agents
@@ -123,16 +124,12 @@ def sampled(
             f"{numbers:.3g} values; expected at most {MOST_NUMBERS:.3g}"
         )
     permutations = relabellings(network, rows, kinds)
-    labels = tuple(range(network.agents)) if errors else kinds
-    shared = scenario.correlation == "shared"
     experiment = Experiment(
         agents=network.agents,
         events=[events(network, rows, step) for step in range(1, network.steps + 1)],
         delay=network.delay,
-        estimator=partial(ESTIMATORS[estimator], sources=labels, shared=shared, relabellings=permutations),
-        sources=error_sources(scenario) if errors else sources_of(scenario),
+        make=partial(make, scenario, estimator, permutations, errors=errors),
         of=moments if errors else claimed_only,
-        kinds=kinds if errors else None,
         runs=runs,
         seed=seed,
     )

@@ -66,6 +66,11 @@ class Scenario:
     metric: str | None
     source: Mapping[str, Any]
 
+    @property
+    def kind_of(self) -> tuple[int, ...]:
+        """Kind of every agent: those of one kind may change places."""
+        return self.sensor_of
+
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any], name: str = "scenario") -> Scenario:
         """Check a mapping with a scenario file's keys and make the scenario.

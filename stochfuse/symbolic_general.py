@@ -24,10 +24,11 @@ from stochfuse.algebra import FIELD
 from stochfuse.engines.enumeration import Request, TooManyError, enumerate_outcomes
 from stochfuse.errors import UsageError
 from stochfuse.events import events, orbits, relabellings
-from stochfuse.general import ESTIMATORS, check_size
+from stochfuse.general import check_size
 from stochfuse.information import Information, Ledger, Sources, evaluate_exactly
 from stochfuse.model import Model, Sensor
 from stochfuse.network import Network, uniform_rows
+from stochfuse.rules import SUMS
 from stochfuse.symbolic import MU, P0, Q, R, exact_number
 from stochfuse.weights import Counts
 
@@ -132,7 +133,7 @@ class GeneralForm:
         drawn = events(network, rows, 1)
         weights = Counts(self.step * len(drawn) + 1)
         ledger = Ledger()
-        estimator = ESTIMATORS[self.estimator](ledger, labels, shared=self.shared, relabellings=permutations)
+        estimator = SUMS[self.estimator](ledger, labels, shared=self.shared, relabellings=permutations)
         groups = tuple(orbits(self.agents, permutations))
         request = Request(self.agents, self.step, (1.0,), lambda _: drawn, weights, groups, most=20_000)
         try:

@@ -25,10 +25,9 @@ import numpy as np
 
 from stochfuse.engines import Progress, uncollected
 from stochfuse.errors import UsageError
-from stochfuse.estimators import Estimator
+from stochfuse.estimators import AdditiveEstimator, Claims, Estimator
 from stochfuse.events import Event, Outcome, concerning, fates, outcomes
-from stochfuse.information import Information, check_definite
-from stochfuse.kalman import Estimate, from_information
+from stochfuse.kalman import Estimate
 from stochfuse.weights import Rows, Weights
 
 MOST_GENERATORS = 6
@@ -142,6 +141,7 @@ def _enumerate(estimator: Estimator, request: Request, progress: Progress) -> St
     number = [1]
     for step, d in enumerate(drawn, start=1):
         number.append(number[-1] * len(fates(request.delay, steps - step)) ** len(d))
+    sums = cast(AdditiveEstimator, estimator)
     two_steps = (
         estimator.additive
         and not weights.memory
@@ -158,7 +158,7 @@ def _enumerate(estimator: Estimator, request: Request, progress: Progress) -> St
         degree = events_up_to[step - 2] - two_steps * len(before)
         if two_steps:
             total = events_up_to[step - 1]
-            endings.append(_two_step_ending(estimator, layer, before, last, degree, total, step, request))
+            endings.append(_two_step_ending(sums, layer, before, last, degree, total, step, request))
         if step < steps or not two_steps:
             left = steps - step + 1
             expected = _expected(sizes, len(layer) * number[step - 1] // number[step - 2], len(estimator.relabellings))
@@ -268,8 +268,9 @@ def _ending(
     for group, agents in enumerate(request.groups):
         for agent in agents:
             concerned = [e._replace(receivers=(agent,)) for e in concerning(last, [agent])]
+            concerned = last if estimator.joint else concerned
             possible = outcomes(concerned, request.agents, request.delay, 0, weights)
-            ids = np.array([[x.fused(agent, o.heard[agent]) for o in possible] for x in exchanges])
+            ids = np.array([[x.fused(agent, o.heard) for o in possible] for x in exchanges])
             factors = weights.factors([o.factor for o in possible], len(concerned))
             share = weights.factors([weights.none()], 0)[0] / len(agents)
             shares = [share if g == group else None for g in range(len(request.groups))]
@@ -279,7 +280,7 @@ def _ending(
 
 
 def _two_step_ending(
-    estimator: Estimator,
+    estimator: AdditiveEstimator,
     layer: dict[Any, Any],
     before: list[Event],
     last: list[Event],
@@ -359,7 +360,7 @@ def _cells(
 class _Table:
     """Numbers the local estimates and the common pedigrees that the views of a step need."""
 
-    def __init__(self, estimator: Estimator, agents: int) -> None:
+    def __init__(self, estimator: AdditiveEstimator, agents: int) -> None:
         self.estimator = estimator
         self._locals: dict[tuple[int, int], int] = {}
         self._common: dict[int, int] = {}
@@ -400,44 +401,26 @@ class _Table:
         return [*locals_, *reversed(brought), -1]
 
 
-def claimed(ending: Ending, values: Information) -> Iterator[tuple[View, slice, Estimate, np.ndarray]]:
+def claimed(ending: Ending, values: Claims) -> Iterator[tuple[View, slice, Estimate, float]]:
     """What is claimed in every outcome, a chunk of states at a time.
-
-    Parameters
-    ----------
-    values : information of every value of the ledger.
 
     Yields
     ------
-    view, states, estimate, Y
-        Estimate of P (states, cells, d, d) and, if the values have states, x (states, cells, d, columns); P's
-        information.
+    view, states, estimate, magnified
+        Estimate of P (states, cells, d, d) and, where there are any, x (states, cells, d, columns); by how much
+        rounding grew in it.
     """
-    d = values.Y.shape[-1]
-    width = d if values.y is None else max(d, values.y.shape[-1])
-    Y = np.concatenate([values.Y, np.zeros((1, d, d))])
-    y = None if values.y is None else np.concatenate([values.y, np.zeros_like(values.y[:1])])
     for view in ending.views:
         cells = len(view.terms[0][1])
-        size = max(1, CHUNK // (cells * d * width))
+        size = max(1, CHUNK // (cells * values.width))
         for first in range(0, len(view.ids), size):
             states = slice(first, first + size)
             ids = view.ids[states]
-            total = _summed(Y, ids, view.terms)
-            check_definite(total, ending.step)
-            information = Information(None if y is None else _summed(y, ids, view.terms), total)
-            yield view, states, from_information(information), total
-
-
-def _summed(values: np.ndarray, ids: np.ndarray, terms: tuple[tuple[int, np.ndarray], ...]) -> np.ndarray:
-    total: Any = 0
-    for sign, index in terms:
-        total = total + sign * values[ids[:, index]]
-    return total
+            yield view, states, *values.estimate([(sign, ids[:, index]) for sign, index in view.terms], ending.step)
 
 
 def expectation(
-    ending: Ending, values: Information, weights: Weights, groups: int, of: Callable[[Estimate], Any]
+    ending: Ending, values: Claims, weights: Weights, groups: int, of: Callable[[Estimate], Any]
 ) -> tuple[list[Any], float]:
     """Expected state and covariance per group of agents, (48)/(49), on the weights' axis.
 
@@ -451,12 +434,12 @@ def expectation(
         What `of` makes, averaged, per group: arrays of shape (width, …), the coefficients A_c of the polynomial in µ,
         or one per row.
     float
-        Largest P_ii Y_ii of any outcome: by how much rounding is magnified when its information is inverted.
+        By how much rounding grew in any outcome: the largest P_ii Y_ii where an information is inverted.
     """
     magnified, kind = 1.0, cast(Any, Estimate)
     sums: list[dict[int, Any]] = [{} for _ in range(groups)]
-    for view, states, estimate, Y in claimed(ending, values):
-        magnified = max(magnified, float((_diagonal(estimate.P) * _diagonal(Y)).max()))
+    for view, states, estimate, grown in claimed(ending, values):
+        magnified = max(magnified, grown)
         averaged = of(estimate)
         kind = type(averaged)
         for place, value in enumerate(averaged):
@@ -470,7 +453,3 @@ def expectation(
                     sums[group][place] = sums[group][place] + part if place in sums[group] else part
     known = [{place: weights.collected(total) for place, total in found.items()} for found in sums]
     return [kind(*map(found.get, range(len(kind._fields)))) for found in known], magnified
-
-
-def _diagonal(A: np.ndarray) -> np.ndarray:
-    return np.diagonal(A, axis1=-2, axis2=-1)

@@ -19,10 +19,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.engines import uncollected
-from stochfuse.estimators import Estimator, Exchange, Late
+from stochfuse.estimators import Claims, Estimator, Exchange, Late, Made
 from stochfuse.events import Event
-from stochfuse.information import Ledger, Sources, check_definite, evaluate
-from stochfuse.kalman import Estimate, Information, from_information
+from stochfuse.kalman import Estimate
 
 BLOCK = 1000
 """Runs drawn from one seed."""
@@ -40,20 +39,16 @@ class Experiment(NamedTuple):
     agents : number of agents.
     events : events of every step.
     delay : probabilities of 0, 1, 2 … steps of delay.
-    estimator : makes the estimator from a ledger.
-    sources : what start and measurements are worth.
+    make : makes the estimator.
     of : makes what is kept of every estimate, a named tuple of arrays or Nones, of a stack of estimates.
-    kinds : kind of each source, where sources are agents that may change places, see `Ledger`.
     runs, seed : size of the sample per row, and its seed.
     """
 
     agents: int
     events: list[list[Event]]
     delay: tuple[float, ...]
-    estimator: Callable[[Ledger], Estimator]
-    sources: Sources
+    make: Callable[[], Made]
     of: Callable[[Estimate], Any]
-    kinds: tuple[int, ...] | None
     runs: int
     seed: int
 
@@ -134,8 +129,7 @@ def run_blocks(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tup
 
 
 def _run_blocks(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tuple[Any, np.ndarray]:
-    ledger = Ledger(experiment.kinds)
-    estimator = experiment.estimator(ledger)
+    estimator, claims = experiment.make()
     drawn = [_draw(experiment, row, block) for row, block in blocks]
     runs = sum(len(steps[0]) for steps in drawn)
     claimed = np.empty((runs, len(experiment.events), experiment.agents), np.int32)
@@ -153,13 +147,21 @@ def _run_blocks(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tu
                 exchange_of, place_of = after[history_of], np.take_along_axis(moved[history_of], place_of, axis=1)
             else:
                 exchanges, exchange_of = histories.onward(), history_of
-    used, index = np.unique(claimed, return_inverse=True)
-    information = evaluate(ledger, experiment.sources)
-    for step in range(1, len(experiment.events) + 1):
-        check_definite(information.Y[np.unique(claimed[:, step - 1])], step)
-    y = None if information.y is None else information.y[used]
-    kept = experiment.of(from_information(Information(y, information.Y[used])))
+    index = np.unique(claimed, return_inverse=True)[1]
+    kept = _kept(experiment, claims(), claimed)
     return kept, index.reshape(claimed.shape).astype(np.int32)
+
+
+def _kept(experiment: Experiment, claims: Claims, claimed: np.ndarray) -> Any:
+    """What is kept of every value claimed by some run, in the order of the values."""
+    parts, order = [], []
+    for step in range(1, claimed.shape[1] + 1):
+        values = np.unique(claimed[:, step - 1])
+        parts.append(experiment.of(claims.estimate([(1, values)], step)[0]))
+        order.append(values)
+    place = np.argsort(np.concatenate(order))
+    columns = zip(*parts, strict=True)
+    return type(parts[0])(*(None if c[0] is None else np.concatenate(c)[place] for c in columns))
 
 
 class _Histories:
@@ -192,7 +194,7 @@ class _Histories:
 
     def fused(self) -> np.ndarray:
         """What is claimed at every place, (pairs, agents)."""
-        return np.array([[x.fused(i, h) for i, h in enumerate(heard)] for x, heard, _ in self.each], np.int32)
+        return np.array([[x.fused(i, heard) for i in range(self.agents)] for x, heard, _ in self.each], np.int32)
 
     def merged(self) -> tuple[list[Exchange], np.ndarray, np.ndarray]:
         """Next exchanges of the different states, each pair's number, and where its agents moved, (pairs, agents)."""

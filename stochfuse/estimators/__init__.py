@@ -1,16 +1,23 @@
 """Estimators: what the agents do with what arrives, one file each, behind one protocol.
 
 An engine drives an estimator through the steps.  `start` is the state before the first exchange; `exchange` opens the
-exchange of one step; from there `fused` tells what an agent makes of what it heard and `after` goes on to the next
-step.  Numbers of agents are bits of a mask: heard = 0b101 means that agents 0 and 2 were heard.
+exchange of one step; from there `fused` tells what an agent makes of what was heard and `after` goes on to the next
+step.  Numbers of agents are bits of a mask: heard[i] = 0b101 means that agent i heard agents 0 and 2.
+
+Until then an estimator writes down values, numbers that stand for estimates, equal for equal pasts; `Claims` puts
+numbers in for all of them at once.  Two families share this protocol.  Those whose estimates are sums of information
+write them into a `Ledger`; all others remember pasts, see `stochfuse.estimators.recursion`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple, Protocol
 
+import numpy as np
+
 from stochfuse.information import Ledger
+from stochfuse.kalman import Estimate
 
 
 class Late(NamedTuple):
@@ -24,8 +31,11 @@ class Late(NamedTuple):
 class Exchange(Protocol):
     """One step's exchange of local estimates."""
 
-    def fused(self, agent: int, heard: int) -> int:
-        """Value, in the estimator's ledger, of what an agent claims after hearing some agents (itself included)."""
+    def fused(self, agent: int, heard: Sequence[int]) -> int:
+        """Value of what an agent claims after every agent heard some (itself included).
+
+        Unless the estimator is `joint`, what the others heard does not matter.
+        """
         ...
 
     def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[Hashable, tuple[int, ...]]:
@@ -57,18 +67,14 @@ class Estimator(Protocol):
 
     Attributes
     ----------
-    ledger : where values are written.
-    sources : source (of start and measurements) of every agent.
-    removes : whether anything is taken for common and removed.
-    additive : whether what agents claim after an exchange is a sum of what they and what they have in common brought
-        there, so that `union` and `common` tell everything.
+    additive : whether what agents claim after an exchange is a sum, in a ledger, of what they and what they have in
+        common brought there, so that `union` and `common` tell everything; see `AdditiveEstimator`.
+    joint : whether what an agent claims depends on what others heard in the same step.
     relabellings : permutations of the agents that leave network and sources as they are.
     """
 
-    ledger: Ledger
-    sources: tuple[int, ...]
-    removes: bool
     additive: bool
+    joint: bool
     relabellings: Sequence[tuple[int, ...]]
 
     def start(self) -> Any:
@@ -80,8 +86,48 @@ class Estimator(Protocol):
         ...
 
 
+class AdditiveEstimator(Estimator, Protocol):
+    """An estimator of sums of information.
+
+    Attributes
+    ----------
+    ledger : where values are written.
+    sources : source (of start and measurements) of every agent.
+    removes : whether anything is taken for common and removed.
+    """
+
+    ledger: Ledger
+    sources: tuple[int, ...]
+    removes: bool
+
+
+class Claims(Protocol):
+    """What the values of an estimator stand for, in numbers.
+
+    Attributes
+    ----------
+    width : how many numbers one estimate takes.
+    """
+
+    width: int
+
+    def estimate(self, terms: Sequence[tuple[int, np.ndarray]], step: int) -> tuple[Estimate, float]:
+        """Estimates of a step, Σ sign · value over (sign, values of any one shape), and by how much rounding grew.
+
+        P has shape (..., d, d); x (..., d, columns) holds data or a noise footprint, None where there is neither.
+        """
+        ...
+
+
+class Made(NamedTuple):
+    """An estimator, and what to call for its numbers once everything of interest has been written down."""
+
+    estimator: Any
+    claims: Callable[[], Claims]
+
+
 class FusionRule:
-    """What estimators of this package have in common.
+    """What estimators that write sums of information have in common.
 
     Parameters
     ----------
@@ -90,6 +136,8 @@ class FusionRule:
     shared : whether all agents start from one common estimate.
     relabellings : permutations of the agents that leave network and sources as they are.
     """
+
+    joint = False
 
     def __init__(
         self,

@@ -162,9 +162,9 @@ class GraphExchange:
             mask &= self.mask(heard)
         return self.pedigrees.fuse(mask) if mask else None
 
-    def fused(self, agent: int, heard: int) -> int:
+    def fused(self, agent: int, heard: Sequence[int]) -> int:
         """Value that an agent claims after hearing some agents, with what else is due."""
-        return self.pedigrees.fuse(self.known(agent, heard))
+        return self.pedigrees.fuse(self.known(agent, heard[agent]))
 
     def known(self, agent: int, heard: int) -> int:
         """Pedigree of an agent after hearing some agents, with what else is due."""

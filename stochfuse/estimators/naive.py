@@ -60,11 +60,11 @@ class NaiveExchange:
         """Nothing is taken for common."""
         return None
 
-    def fused(self, agent: int, heard: int) -> int:
+    def fused(self, agent: int, heard: Sequence[int]) -> int:
         """Value that an agent claims after hearing some agents, with what else is due."""
         if not self._due[agent]:
-            return self.union(heard)
-        terms = [(self.union(heard), 1), *((value, 1) for value in self._due[agent])]
+            return self.union(heard[agent])
+        terms = [(self.union(heard[agent]), 1), *((value, 1) for value in self._due[agent])]
         return self.estimator.ledger.combine(self._step, terms)
 
     def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[State, tuple[int, ...]]:
@@ -89,7 +89,7 @@ class NaiveExchange:
 
     def _next(self, heard: Sequence[int], late: Sequence[Late]) -> tuple[list[int], list[tuple[int, int, int]]]:
         ledger, sources = self.estimator.ledger, self.estimator.sources
-        agents = [ledger.local(self.fused(i, h), sources[i]) for i, h in enumerate(heard)]
+        agents = [ledger.local(self.fused(i, heard), source) for i, source in enumerate(sources)]
         under_way = [(r, left - 1, value) for r, left, value in self.state.late if left > 0]
         under_way += [(m.receiver, m.delay - 1, self.state.agents[m.sender]) for m in late]
         return agents, under_way

@@ -79,9 +79,9 @@ class OptimalExchange:
                 union[t] |= mask
         return tuple(union)
 
-    def fused(self, agent: int, heard: int) -> int:
+    def fused(self, agent: int, heard: Sequence[int]) -> int:
         """Value that an agent would claim after hearing some agents, with what else is due."""
-        return self.estimator.value(self.held(agent, heard))
+        return self.estimator.value(self.held(agent, heard[agent]))
 
     def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[State, tuple[int, ...]]:
         """State before the next exchange, in the order that like states share, and the agent at each place of it."""

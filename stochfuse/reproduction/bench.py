@@ -216,12 +216,13 @@ def _averages(found: Outcomes, ending: Ending) -> Averages:
     """
     weights, least, most = found.weights, np.inf, 0.0
     total: Any = 0.0
-    noises = 0 if found.values.y is None else found.values.y.shape[-1]
+    noises = 0
     for view, states, estimate, _ in claimed(ending, found.values):
         P = estimate.P[..., 0]
         least, most = min(least, P.min()), max(most, P.max())
         parts = [np.add.reduceat(P, view.starts, axis=1)]
-        if noises:
+        if estimate.x is not None:
+            noises = estimate.x.shape[-1]
             x = estimate.x[..., 0, :]
             parts.append(np.add.reduceat(x, view.starts, axis=1))
             products = [np.swapaxes(part, 1, 2) @ part for part in np.split(x, view.starts[1:], axis=1)]
