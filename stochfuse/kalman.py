@@ -93,13 +93,18 @@ def update(estimate: Estimate, H: Any, R: Any, z: Any = None, *, algebra: Algebr
     """
     x, P = estimate
     K = gain(P, H, R, algebra=algebra)
-    A = algebra.identity_like(P) - K @ H
-    posterior = algebra.symmetric(A @ P @ algebra.transpose(A) + K @ R @ algebra.transpose(K))
+    posterior = corrected(P, K, H, R, algebra=algebra)
     if x is None:
         return Estimate(None, posterior)
     if z is None:
         raise ValueError("expected a measurement z for an estimate that has a state; got None")
     return Estimate(x + K @ (z - H @ x), posterior)
+
+
+def corrected(P: Any, K: Any, H: Any, R: Any, *, algebra: Algebra = NUMPY) -> Any:
+    """Covariance after a correction with any gain K, (I − KH) P (I − KH)ᵀ + K R Kᵀ; shapes as for `update`."""
+    A = algebra.identity_like(P) - K @ H
+    return algebra.symmetric(A @ P @ algebra.transpose(A) + K @ R @ algebra.transpose(K))
 
 
 def gain(P: Any, H: Any, R: Any, *, algebra: Algebra = NUMPY) -> Any:

@@ -16,7 +16,20 @@ from stochfuse.quantities import QUANTITIES, Moments
 from stochfuse.scenario import Scenario, link_rows
 
 METHODS = ("simplified", "general", "optimal", "naive", "monte-carlo")
-ESTIMATORS = ("local-fusion-graph", "naive", "optimal")
+ESTIMATORS = (
+    "local-fusion-graph",
+    "naive",
+    "optimal",
+    "covariance-intersection",
+    "split-ci",
+    "blender",
+    "joint-blender",
+    "equivalent-measurement",
+    "independent-measurements",
+    "lwin",
+    "itns",
+    "stand-alone",
+)
 MOST_GRAPHS = 100_000
 RUNS, SEED = 1000, 1
 SELF_CONSISTENT = (

@@ -34,6 +34,43 @@ class Sensor:
 
 
 @dataclass(frozen=True, eq=False)
+class Filter:
+    """An agent's own filter, of a state x_i of its own or of a part of the state, x = M x_i + s.
+
+    Parameters
+    ----------
+    F, Q : (d_i, d_i) or (steps, d_i, d_i) transition and process noise.
+    P0 : (d_i, d_i) covariance of the first estimate.
+    M, s : (d, d_i) and (d, 1), how the filter's output is shaped into the state.
+    """
+
+    F: np.ndarray
+    Q: np.ndarray
+    P0: np.ndarray
+    M: np.ndarray
+    s: np.ndarray
+
+    @property
+    def dimension(self) -> int:
+        """Number d_i of state components."""
+        return self.F.shape[-1]
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """How the agents' measurement noises hang together.
+
+    Parameters
+    ----------
+    correlation : (n, n) correlation of the agents' noises, component by component in units of their own deviations.
+    disturbance : (Σp, Σp) bound on the covariance of an uncertain disturbance, or None.
+    """
+
+    correlation: np.ndarray
+    disturbance: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class Model:
     """How the state moves, and what its components are called.
 

@@ -37,6 +37,7 @@ class Network:
     delay : probabilities of a delay of 0, 1, 2 … steps.
     burst : (4,) good→bad, bad→good, delivery in good, delivery in bad; None for links without memory.
     case_bursts : the same for each of the cases.
+    hears : (n, n) whether agent i may hear agent j, or None where all may hear whom the architecture lets them hear.
     """
 
     agents: int
@@ -47,6 +48,7 @@ class Network:
     delay: tuple[float, ...] = (1.0,)
     burst: np.ndarray | None = None
     case_bursts: tuple[np.ndarray | None, ...] = ()
+    hears: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,12 @@ class LinkRows:
         if self.uniform:
             return self.link.mean(axis=1) if self.varies else self.link
         steps = range(1, network.steps + 1 if self.varies else 2)
-        return np.mean([self.matrices(network, k).mean(axis=(1, 2)) for k in steps], axis=0)
+        there = slice(None)
+        if network.hears is not None:
+            there = np.take_along_axis(network.hears, possible_senders(network.architecture, network.agents), axis=1)
+        return np.mean(
+            [self.matrices(network, k)[:, there].reshape(len(self.link), -1).mean(axis=1) for k in steps], axis=0
+        )
 
 
 def stacked_rows(names: tuple[str, ...] | None, links: Sequence[np.ndarray], network: Network) -> LinkRows:
@@ -110,6 +117,14 @@ def stacked_rows(names: tuple[str, ...] | None, links: Sequence[np.ndarray], net
     shape = ((steps,) if varies else ()) + ((n, n) if matrix else ())
     full = [a[:, None, None] if a.ndim == 1 and matrix else a for a in links]
     return LinkRows(names, np.stack([np.broadcast_to(a, shape) for a in full]))
+
+
+def restricted(rows: LinkRows, network: Network) -> LinkRows:
+    """Return the rows with probability 0 where an agent cannot hear another (network.hears)."""
+    if network.hears is None:
+        return rows
+    link = rows.link[..., None, None] if rows.uniform else rows.link
+    return replace(rows, link=link * network.hears)
 
 
 def possible_senders(architecture: str, agents: int) -> np.ndarray:
@@ -163,6 +178,10 @@ def delivery_after_failures(burst: np.ndarray, in_time: np.ndarray) -> np.ndarra
 
 def default_rows(network: Network) -> LinkRows:
     """Rows that a scenario asks for itself: its cases, its link probability, or the thesis' five."""
+    return restricted(_default_rows(network), network)
+
+
+def _default_rows(network: Network) -> LinkRows:
     if network.cases:
         names, arrays = zip(*network.cases, strict=True)
         rows = stacked_rows(names, arrays, network)

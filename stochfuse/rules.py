@@ -13,13 +13,20 @@ from typing import Any
 
 import numpy as np
 
+from stochfuse.errors import UsageError
 from stochfuse.estimators import Made
+from stochfuse.estimators.alone import StandAlone
+from stochfuse.estimators.blender import Blender, JointBlender
+from stochfuse.estimators.cooperative import Itns, Lwin
+from stochfuse.estimators.equivalent import EquivalentMeasurement, IndependentMeasurements
+from stochfuse.estimators.intersection import CovarianceIntersection, SplitCovarianceIntersection
 from stochfuse.estimators.local_fusion_graph import LocalFusionGraph
 from stochfuse.estimators.naive import NaiveFusion
 from stochfuse.estimators.optimal import OptimalFusion
+from stochfuse.estimators.recursion import RecursiveEstimator
 from stochfuse.information import InformationClaims, Ledger, Sources, evaluate
-from stochfuse.scenario import Scenario
-from stochfuse.sources import error_sources, sources_of
+from stochfuse.scenario import Scenario, require_independent_noise
+from stochfuse.sources import error_sources, sources_of, world_of
 
 SUMS: dict[str, Any] = {
     "local-fusion-graph": LocalFusionGraph,
@@ -27,6 +34,20 @@ SUMS: dict[str, Any] = {
     "optimal": OptimalFusion,
 }
 """Estimators whose estimates are sums of information."""
+PASTS: dict[str, type[RecursiveEstimator]] = {
+    "covariance-intersection": CovarianceIntersection,
+    "split-ci": SplitCovarianceIntersection,
+    "blender": Blender,
+    "joint-blender": JointBlender,
+    "equivalent-measurement": EquivalentMeasurement,
+    "independent-measurements": IndependentMeasurements,
+    "lwin": Lwin,
+    "itns": Itns,
+    "stand-alone": StandAlone,
+}
+"""Estimators that remember pasts."""
+WITH_OWN_STATES = ("covariance-intersection", "split-ci", "lwin", "itns", "stand-alone")
+WITH_OWN_FILTERS = ("blender", "joint-blender")
 
 
 def make(
@@ -51,6 +72,11 @@ def make(
     UsageError
         If the estimator is not one for such a scenario.
     """
+    check(scenario, name)
+    if name in PASTS:
+        if records is not None:
+            raise UsageError(f"estimator {name}: its states cannot be had for a record of measurements")
+        return PASTS[name](world_of(scenario), scenario.kind_of, relabellings, errors=errors).make()
     everyone = tuple(range(scenario.network.agents))
     # records tell like agents apart; footprints only say whose noise is whose
     labels = everyone if errors or records is not None else scenario.sensor_of
@@ -63,3 +89,16 @@ def make(
 
 def _claims(ledger: Ledger, sources: Sources) -> InformationClaims:
     return InformationClaims(evaluate(ledger, sources))
+
+
+def check(scenario: Scenario, name: str) -> None:
+    """Raise UsageError if an estimator is not one for such a scenario."""
+    who = f"estimator {name}"
+    if scenario.own and name not in WITH_OWN_STATES:
+        raise UsageError(f"{who}: expected agents that track one state, got states of their own (model.own)")
+    if scenario.filters and not scenario.own and name not in WITH_OWN_FILTERS:
+        raise UsageError(f"{who}: expected one model for all agents, got parallel filters ([[agent]] F, Q, P, M or s)")
+    if name == "optimal":
+        require_independent_noise(scenario, who)
+    if name in PASTS and not PASTS[name].takes_late and scenario.network.delay != (1.0,):
+        raise UsageError(f"{who}: expected messages without delay, got network.delay")

@@ -16,7 +16,7 @@ from __future__ import annotations
 import copy
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +24,12 @@ import numpy as np
 
 from stochfuse.checks import Checker, shown
 from stochfuse.errors import Problem, ScenarioError, UsageError
+from stochfuse.fusion.cooperative import Relation
 from stochfuse.metrics import metric as metric_of
-from stochfuse.model import Model, Sensor
-from stochfuse.network import LinkRows, Network, default_rows, stacked_rows, uniform_rows
-from stochfuse.scenario_tables import read_link, read_model, read_network, read_sensors
+from stochfuse.model import Filter, Model, Noise, Sensor
+from stochfuse.network import LinkRows, Network, default_rows, restricted, stacked_rows, uniform_rows
+from stochfuse.noise_table import read_noise
+from stochfuse.scenario_tables import read_filters, read_link, read_model, read_network, read_sensors
 
 SCHEMA = "stochfuse.scenario/1"
 DEFAULT = "thesis-transient"
@@ -52,6 +54,12 @@ class Scenario:
     network : agents and links.
     metric : the metric that the scenario asks to be shown, or None.
     source : the mapping it was made from, as the file has it.
+    own : whether every agent has a state of its own.
+    filters : each agent's own filter, where they differ from the model; else empty.
+    noise : how measurement noises hang together, or None if they are independent.
+    process : (Σd_i, Σd_i) process noise of all parallel filters together, or None if they have nothing in common.
+    relations : what agent i measures of agent j, by (i, j) counted from 0.
+    agent : number of the agent that the scenario asks to be shown, or None.
     """
 
     name: str
@@ -65,11 +73,21 @@ class Scenario:
     network: Network
     metric: str | None
     source: Mapping[str, Any]
+    own: bool = False
+    filters: tuple[Filter, ...] = ()
+    noise: Noise | None = None
+    process: np.ndarray | None = None
+    relations: Mapping[tuple[int, int], Relation] = field(default_factory=dict)
+    agent: int | None = None
 
     @property
     def kind_of(self) -> tuple[int, ...]:
         """Kind of every agent: those of one kind may change places."""
-        return self.sensor_of
+        alike = not self.own and not self.filters
+        if self.noise is not None:
+            c = self.noise.correlation
+            alike &= len(set(c[~np.eye(len(c), dtype=bool)])) <= 1 and self.noise.disturbance is None
+        return self.sensor_of if alike else tuple(range(self.network.agents))
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any], name: str = "scenario") -> Scenario:
@@ -99,6 +117,21 @@ class Scenario:
     def to_mapping(self) -> dict[str, Any]:
         """Return the mapping that the scenario was made from, with a file's keys."""
         return {"schema": SCHEMA, **copy.deepcopy(dict(self.source))}
+
+
+def require_one_state(scenario: Scenario, who: str) -> None:
+    """Raise UsageError unless all agents track the state of one model."""
+    if scenario.own or scenario.filters:
+        what = "states of their own (model.own)" if scenario.own else "filters of their own"
+        raise UsageError(f"{who}: expected agents that track one state by one model, got agents with {what}")
+
+
+def require_independent_noise(scenario: Scenario, who: str) -> None:
+    """Raise UsageError if measurement noises hang together."""
+    if scenario.noise is not None:
+        raise UsageError(
+            f"{who}: expected independent measurement noises, got [noise] with a correlation or a disturbance"
+        )
 
 
 def _first(link: np.ndarray, steps: int) -> np.ndarray:
@@ -156,14 +189,14 @@ def link_rows(scenario: Scenario, link: Any = None) -> LinkRows:
     array = check.array("link", link, expected)
     if array is not None and array.ndim <= 1 and array.size:
         if array.min() >= 0 and array.max() <= 1:
-            return uniform_rows(np.atleast_1d(array))
+            return restricted(uniform_rows(np.atleast_1d(array)), network)
         check.note("link", "probabilities between 0 and 1", f"{array.min() if array.min() < 0 else array.max():g}")
     elif array is not None and array.ndim == 3 and array.size:
         matrices = [
             read_link(check, "link", matrix, network.agents, network.steps, network.architecture) for matrix in array
         ]
         if not check.problems:
-            return stacked_rows(None, [m for m in matrices if m is not None], network)
+            return restricted(stacked_rows(None, [m for m in matrices if m is not None], network), network)
     elif array is not None:
         check.note("link", expected, f"an array of shape {array.shape}")
     raise UsageError("; ".join(map(str, check.problems)))
@@ -258,19 +291,32 @@ def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> S
     if not isinstance(mapping, Mapping):
         raise ScenarioError(name, structure)
     check = Checker(skip={problem.path for problem in structure})
-    tables = {
-        key: mapping[key] if isinstance(mapping.get(key), dict) else {} for key in ("model", "initial", "network")
-    }
+    names = ("model", "initial", "network", "noise", "report")
+    tables = {key: mapping[key] if isinstance(mapping.get(key), dict) else {} for key in names}
+    agents, initial = mapping.get("agent"), tables["initial"]
+    agents = agents if isinstance(agents, list) else None
     network = read_network(check, tables["network"])
-    steps = network.steps if network else 1
-    model, default = read_model(check, tables["model"], steps)
+    own = tables["model"].get("own") is True
+    if isinstance(mapping.get("navigation"), dict):
+        (model, P0), default = _navigation(check, mapping, network), None
+    else:
+        model, default = read_model(check, tables["model"], network.steps if network else 1)
+        P0 = check.covariance("initial.P", initial.get("P"), model.dimension if model else None, 0)
     d = model.dimension if model else None
-    sensors, sensor_of = read_sensors(check, mapping.get("agent"), default, d, network)
-    initial = tables["initial"]
-    P0 = check.covariance("initial.P", initial.get("P"), d, 0)
+    filters = read_filters(check, agents, model, P0, own, network)
+    sensors, sensor_of = read_sensors(check, agents, default, d, filters, network)
     correlation = check.choice("initial.correlation", initial.get("correlation", "independent"), CORRELATIONS)
+    if correlation == "shared" and (own or filters):
+        check.note("initial.correlation", '"independent", since agents have states or filters of their own', "'shared'")
     x0 = check.vector("initial.x", initial.get("x"), d)
     error = check.vector("initial.error", initial.get("error"), d)
+    noise, process = None, None
+    if network is not None and len(sensor_of) == network.agents:
+        noise, process = read_noise(check, tables["noise"], [sensors[s] for s in sensor_of], filters, own)
+    relations = _relations(check, mapping, model, network, own)
+    agent = check.integer("report.agent", tables["report"].get("agent"), 1)
+    if agent is not None and network is not None and agent > network.agents:
+        check.note("report.agent", f"an agent from 1 to {network.agents}", str(agent))
     report = mapping.get("report")
     metric = report.get("metric") if isinstance(report, dict) else None
     if isinstance(metric, str) and model is not None:
@@ -295,4 +341,44 @@ def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> S
         network=network,
         metric=metric,
         source={key: value for key, value in mapping.items() if key != "schema"},
+        own=own,
+        filters=filters,
+        noise=noise,
+        process=process,
+        relations=relations,
+        agent=agent,
     )
+
+
+def _navigation(
+    check: Checker, mapping: Mapping[str, Any], network: Network | None
+) -> tuple[Model | None, np.ndarray | None]:
+    """Model and first covariance of an inertial navigation system."""
+    from stochfuse.navigation_table import read_navigation
+
+    for key in ("model", "initial"):
+        if key in mapping:
+            check.note(key, "nothing beside [navigation], which takes its place", "a table")
+    errors = read_navigation(check, mapping["navigation"], network.steps if network else 1)
+    if errors is None:
+        return None, None
+    return Model(errors.F, errors.Q, np.zeros((len(errors.P0), 1)), errors.states, errors.units), errors.P0
+
+
+def _relations(
+    check: Checker, mapping: Mapping[str, Any], model: Model | None, network: Network | None, own: bool
+) -> Mapping[tuple[int, int], Relation]:
+    """What agents measure of each other."""
+    tables = [table for table in mapping.get("agent") or [] if isinstance(table, dict)]
+    if "cooperative" not in mapping and not any("position" in table for table in tables):
+        if own:
+            check.note("cooperative", "what agents with states of their own measure of each other", "nothing")
+        return {}
+    if model is None or network is None:
+        return {}
+    from stochfuse.cooperative_table import read_cooperative
+
+    if not own:
+        check.note("model.own", "true, since agents measure each other's own places", "false")
+    found = read_cooperative(check, mapping.get("cooperative"), tables, model.states, network.agents, network.steps)
+    return {} if found is None else found.pairs

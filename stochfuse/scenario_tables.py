@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from stochfuse.checks import Checker, shown
-from stochfuse.model import Model, Sensor
+from stochfuse.model import Filter, Model, Sensor
 from stochfuse.network import ARCHITECTURES, Network, mean_delivery
 
 
@@ -25,7 +25,8 @@ def read_network(check: Checker, table: Mapping[str, Any]) -> Network | None:
     burst = _burst(check, "network", table)
     link = link if burst is None else mean_delivery(burst)
     cases, bursts = [], []
-    for i, case in enumerate(table.get("case") or [], start=1):
+    given = table.get("case")
+    for i, case in enumerate(given if isinstance(given, list) else [], start=1):
         if not isinstance(case, dict):
             continue
         path = f"network.case[{i}].link"
@@ -44,7 +45,27 @@ def read_network(check: Checker, table: Mapping[str, Any]) -> Network | None:
             cases.append((name, own))
             bursts.append(bursty)
     delay = _delay(check, table.get("delay"))
-    return Network(agents, steps, architecture, link, tuple(cases), delay, burst, tuple(bursts))
+    hears = _hears(check, table.get("hears"), agents, architecture)
+    if hears is not None and any(b is not None for b in (burst, *bursts)):
+        check.note("network.hears", "links without memory (no burst)", "a burst")
+    return Network(agents, steps, architecture, link, tuple(cases), delay, burst, tuple(bursts), hears)
+
+
+def _hears(check: Checker, value: Any, agents: int, architecture: str) -> np.ndarray | None:
+    if not isinstance(value, list):
+        return None
+    if architecture != "ad-hoc":
+        check.note("network.hears", 'nothing unless network.architecture is "ad-hoc"', f'"{architecture}"')
+    if len(value) != agents:
+        check.note("network.hears", f"one list for each of the {agents} agents", f"{len(value)}")
+        return None
+    hears = np.zeros((agents, agents), dtype=bool)
+    for i, others in enumerate(value):
+        known = [j for j in others if isinstance(j, int) and 1 <= j <= agents and j != i + 1]
+        if len(known) < len(others):
+            check.note(f"network.hears[{i + 1}]", f"other agents from 1 to {agents}", shown(others))
+        hears[i, [j - 1 for j in known]] = True
+    return hears
 
 
 def _burst(check: Checker, path: str, table: Mapping[str, Any]) -> np.ndarray | None:
@@ -167,20 +188,34 @@ def _sensor(
 
 
 def read_sensors(
-    check: Checker, agents: Any, default: Sensor | None, d: int | None, network: Network | None
+    check: Checker,
+    agents: Any,
+    default: Sensor | None,
+    d: int | None,
+    filters: Sequence[Filter],
+    network: Network | None,
 ) -> tuple[tuple[Sensor, ...], tuple[int, ...]]:
     """Read [[agent]]: the different sensors, and which of them every agent has."""
-    if network is None or default is None:
+    if network is None or (default is None and not agents):
         return (), ()
     if not agents:
-        return (default,), (0,) * network.agents
+        return (default,) if default else (), (0,) * network.agents
     if len(agents) != network.agents:
         check.note("agent", f"one [[agent]] table for each of the {network.agents} agents", f"{len(agents)}")
         return (), ()
     different: dict[tuple[Any, ...], int] = {}
     sensors, sensor_of = [], []
     for i, table in enumerate(agents, start=1):
-        sensor = _sensor(check, f"agent[{i}]", table if isinstance(table, dict) else {}, d, network.steps, default)
+        path, table = f"agent[{i}]", table if isinstance(table, dict) else {}
+        size = filters[i - 1].dimension if filters else d
+        if table.get("sensor") is False:
+            sensor = Sensor(np.zeros((0, size or 1)), np.zeros((0, 0)))
+            for key in {"H", "R"} & set(table):
+                check.note(f"{path}.{key}", "nothing, since sensor = false", shown(table[key]))
+        else:
+            # the model's sensor is for filters that have as many states as the model
+            fitting = default if default is None or default.H.shape[-1] == size else None
+            sensor = _sensor(check, path, table, size, network.steps, fitting)
         if sensor is None:
             continue
         key = (sensor.H.shape, sensor.H.tobytes(), sensor.R.shape, sensor.R.tobytes())
@@ -189,3 +224,47 @@ def read_sensors(
             sensors.append(sensor)
         sensor_of.append(different[key])
     return tuple(sensors), tuple(sensor_of)
+
+
+def read_filters(
+    check: Checker, agents: Any, model: Model | None, P0: np.ndarray | None, own: bool, network: Network | None
+) -> tuple[Filter, ...]:
+    """Read the agents' own filters from [[agent]]; none where all have the model's."""
+    tables = [table if isinstance(table, dict) else {} for table in agents or []]
+    keys = ("F", "Q", "P") if own else ("F", "Q", "P", "M", "s")
+    if model is None or P0 is None or network is None or not any(key in table for table in tables for key in keys):
+        return ()
+    found = [_filter(check, f"agent[{i}]", table, model, P0, network.steps) for i, table in enumerate(tables, start=1)]
+    filters = tuple(f for f in found if f is not None)
+    for i, f in enumerate(filters, start=1):
+        if own and f.dimension != model.dimension:
+            check.note(f"agent[{i}].F", f"a {model.dimension}×{model.dimension} matrix", f"{f.dimension} states")
+    return filters if len(filters) == len(found) else ()
+
+
+def _filter(
+    check: Checker, path: str, table: Mapping[str, Any], model: Model, P0: np.ndarray, steps: int
+) -> Filter | None:
+    F = check.matrix(f"{path}.F", table.get("F"), None, None, steps) if "F" in table else model.F
+    if F is None or F.shape[-1] != F.shape[-2]:
+        if F is not None:
+            check.note(f"{path}.F", "a square matrix", f"a {F.shape[-2]}×{F.shape[-1]} matrix")
+        return None
+    d, D = F.shape[-1], model.dimension
+    Q = _own(check, f"{path}.Q", table.get("Q"), d, steps, model.Q if d == D else None)
+    P = _own(check, f"{path}.P", table.get("P"), d, 0, P0 if d == D else None)
+    M = check.matrix(f"{path}.M", table.get("M"), D, d, 0) if "M" in table else np.eye(D) if d == D else None
+    s = check.vector(f"{path}.s", table.get("s"), D)
+    if M is None and "M" not in table:
+        check.note(f"{path}.M", f"a {D}×{d} mapping into the state, since the filter has {d} states", "nothing")
+    if Q is None or P is None or M is None:
+        return None
+    return Filter(F, Q, P, M, np.zeros((D, 1)) if s is None else s)
+
+
+def _own(check: Checker, path: str, value: Any, d: int, steps: int, default: np.ndarray | None) -> np.ndarray | None:
+    if value is not None:
+        return check.covariance(path, value, d, steps)
+    if default is None:
+        check.note(path, f"a {d}×{d} covariance, to go with its own F", "nothing")
+    return default

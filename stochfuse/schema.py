@@ -11,7 +11,9 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
 
 from stochfuse.checks import shown
+from stochfuse.cooperative_schema import CooperativeTable
 from stochfuse.errors import Problem
+from stochfuse.navigation_schema import NavigationTable
 
 Number = Annotated[int, Strict()] | Annotated[float, Strict()]
 Vector = Number | list[Number] | list[list[Number]]
@@ -30,6 +32,7 @@ class ModelTable(_Table):
     H: Matrix = Field(description="measurement matrix, p×d")
     Q: Matrix = Field(description="process noise covariance, d×d, or as many as G has columns")
     R: Matrix = Field(description="measurement noise covariance, p×p, positive definite")
+    own: bool = Field(False, strict=True, description="true: every agent has a state of its own, all of this model")
     G: Matrix | None = Field(None, description="process noise gain, default the identity")
     B: Matrix | None = Field(None, description="input matrix")
     u: Vector | None = Field(None, description="known input, needs B")
@@ -77,6 +80,9 @@ class NetworkTable(_Table):
         "left out, it is tabulated from 0 to 1",
     )
     burst: BurstTable | None = Field(None, description="bursty links, instead of a link probability")
+    hears: list[list[int]] | None = Field(
+        None, description="for each agent the agents that it may hear; default: all that the architecture lets it hear"
+    )
     delay: Number | list[Number] | None = Field(
         None, description="delay of messages in steps, or the probabilities of a delay of 0, 1, 2 … steps"
     )
@@ -84,16 +90,40 @@ class NetworkTable(_Table):
 
 
 class AgentTable(_Table):
-    """One agent's own sensor, where it differs from the model's."""
+    """One agent's own sensor, filter and place, where they differ from the model's."""
 
     H: Matrix | None = None
     R: Matrix | None = None
+    sensor: bool = Field(True, strict=True, description="false: this agent measures nothing itself")
+    F: Matrix | None = Field(None, description="transition of the agent's own filter")
+    Q: Matrix | None = Field(None, description="process noise of the agent's own filter")
+    P: Matrix | None = Field(None, description="covariance of the agent's first estimate")
+    M: Matrix | None = Field(None, description="mapping of a parallel filter's state into the state, x = M x_i + s")
+    s: Vector | None = Field(None, description="offset of that mapping, default zero")
+    position: Vector | None = Field(None, description="nominal place for cooperative measurements, or one per step")
+
+
+class NoiseTable(_Table):
+    """How noises hang together that are otherwise independent."""
+
+    correlation: Number | list[list[Number]] | None = Field(
+        None, description="correlation of the agents' measurement noises: one number for all pairs, or a matrix"
+    )
+    disturbance: Number | list[Number] | list[list[Number]] | None = Field(
+        None,
+        description="bound on the covariance of an uncertain disturbance of the measurements: a variance for every "
+        "component, the variances of one sensor's components, or a matrix over all agents' components",
+    )
+    process: list[list[Number]] | None = Field(
+        None, description="process noise covariance of all parallel filters together, their states one below another"
+    )
 
 
 class ReportTable(_Table):
     """How results are shown where the command does not say."""
 
     metric: str | None = Field(None, description="default metric, as --metric takes it")
+    agent: int | None = Field(None, ge=1, strict=True, description="whose estimate is shown; default: the mean")
 
 
 class ScenarioFile(_Table):
@@ -105,9 +135,12 @@ class ScenarioFile(_Table):
 
     schema_: Literal["stochfuse.scenario/1"] = Field("stochfuse.scenario/1", alias="schema")
     description: str | None = None
-    model: ModelTable
-    initial: InitialTable
+    model: ModelTable | None = Field(None, description="needed unless there is a navigation table")
+    initial: InitialTable | None = Field(None, description="needed unless there is a navigation table")
+    navigation: NavigationTable | None = Field(None, description="inertial navigation, instead of model and initial")
     network: NetworkTable
+    noise: NoiseTable | None = None
+    cooperative: CooperativeTable | None = None
     agent: list[AgentTable] | None = Field(None, description="one entry per agent, for unlike agents")
     report: ReportTable | None = None
 
@@ -130,10 +163,15 @@ _SHAPES = {
     "vector": "a number, a list of numbers, or one list per step",
     "link": "a probability, a matrix of them, or one of either per step",
     "delay": "a number of steps or a list of probabilities",
+    "place": "a list of coordinates, or one such list per step",
+    "correlation": "a number or a matrix (a list of rows)",
+    "disturbance": "a variance, a list of variances, or a matrix (a list of rows)",
 }
 _SHAPE_OF = {
-    **dict.fromkeys(("F", "H", "Q", "R", "G", "B", "P"), "matrix"),
-    **dict.fromkeys(("u", "x", "error"), "vector"),
+    **dict.fromkeys(("F", "H", "Q", "R", "G", "B", "P", "M"), "matrix"),
+    **dict.fromkeys(("u", "x", "error", "s"), "vector"),
+    "position": "place",
+    "disturbance": "disturbance",
     "link": "link",
     "delay": "delay",
 }
@@ -141,19 +179,22 @@ _SHAPE_OF = {
 
 def structure_problems(mapping: Any) -> list[Problem]:
     """Return every key of a parsed file that is unknown, missing or of the wrong kind, once each."""
+    problems = {}
+    if isinstance(mapping, dict) and "navigation" not in mapping:
+        problems = {key: Problem(key, "a value", "nothing") for key in ("model", "initial") if key not in mapping}
     try:
         ScenarioFile.model_validate(mapping)
     except ValidationError as error:
-        problems = {}
         for entry in error.errors(include_url=False, include_context=True):
             problem = _problem(entry)
             problems.setdefault(problem.path, problem)
-        return list(problems.values())
-    return []
+    return list(problems.values())
 
 
 def _problem(entry: Any) -> Problem:
     location = list(entry["loc"])
+    if location[:2] == ["noise", "correlation"]:
+        return Problem("noise.correlation", _SHAPES["correlation"], _got(entry, location[2:]))
     for place, part in enumerate(location):
         if (part in _SHAPE_OF and place < len(location) - 1) or (part in _SHAPE_OF and entry["type"].endswith("_type")):
             # a union reports one error per alternative: say once what the key takes

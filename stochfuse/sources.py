@@ -17,16 +17,19 @@ over sources a product of matrices.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from stochfuse.errors import UsageError
 from stochfuse.information import Sources
-from stochfuse.kalman import Estimate, Information, factor, to_information
-from stochfuse.model import at_step
+from stochfuse.kalman import Estimate, Information, to_information
+from stochfuse.model import Filter, at_step
 from stochfuse.quantities import Moments
 from stochfuse.scenario import Scenario
+from stochfuse.world import Footprints, World
 
 
 def sources_of(scenario: Scenario, records: np.ndarray | None = None, *, by_agent: bool = False) -> Sources:
@@ -58,43 +61,69 @@ def error_sources(scenario: Scenario) -> Sources:
     UsageError
         If the initial covariance has no inverse.
     """
-    n, d, steps = scenario.network.agents, scenario.model.dimension, scenario.network.steps
+    world = world_of(scenario)
+    footprints, steps, everyone = Footprints(world), range(2, world.steps + 1), range(world.agents)
+    starts = [_start(scenario, footprints.start(rows)) for rows in world.states]
+    # all agents see one process noise, so that the first agent's rows are everyone's
+    moved = [footprints.process(step, world.states[0]) for step in steps]
+    inputs = np.stack([np.zeros((scenario.model.dimension, footprints.columns)), *moved])
+    nothing = [np.zeros((H.shape[-2], footprints.columns)) for H in world.H]
+    records = [nothing, *([footprints.measured(step, agent) for agent in everyone] for step in steps)]
     sensors = [scenario.sensors[kind] for kind in scenario.sensor_of]
-    shared = scenario.correlation == "shared"
-    widths = [[d] * (1 if shared else n)]
-    widths += [[d, *(at_step(sensor.R, step).shape[-1] for sensor in sensors)] for step in range(2, steps + 1)]
-    first = np.cumsum([0, *(width for step in widths for width in step)])
-    columns = int(first[-1]) + 1
-
-    def placed(block: np.ndarray, number: int) -> np.ndarray:
-        out = np.zeros((len(block), columns))
-        out[:, first[number] : first[number] + block.shape[1]] = block
-        return out
-
-    L0 = factor(scenario.P0)
-    starts = []
-    for agent in range(n):
-        x = placed(L0, 0 if shared else agent)
-        x[:, -1:] = 0.0 if scenario.error is None else scenario.error
-        starts.append(_start(scenario, x))
-    inputs = np.zeros((steps, d, columns))
-    records = [[np.zeros((at_step(s.R, 1).shape[-1], columns)) for s in sensors]]
-    number = len(widths[0])
-    for step in range(2, steps + 1):
-        inputs[step - 1] = placed(-factor(at_step(scenario.model.Q, step)), number)
-        noises = [np.linalg.cholesky(at_step(sensor.R, step)) for sensor in sensors]
-        records.append([placed(C, number + 1 + i) for i, C in enumerate(noises)])
-        number += 1 + n
     return Sources(replace(scenario.model, Bu=inputs), sensors, starts, records)
 
 
-def moments(estimate: Estimate) -> Moments:
+def world_of(scenario: Scenario) -> World:
+    """Return what the agents' filters are told, and how all noises truly hang together."""
+    n, steps, model = scenario.network.agents, scenario.network.steps, scenario.model
+    sensors = [scenario.sensors[kind] for kind in scenario.sensor_of]
+    filters = scenario.filters or (_filter(scenario),) * n
+    together = np.ones((n, n)) if not scenario.own and not scenario.filters else np.eye(n)
+    shared = np.ones((n, n)) if scenario.correlation == "shared" else np.eye(n)
+    if scenario.filters:
+        Q, P0 = _stacked([f.Q for f in filters], steps), _stacked([f.P0 for f in filters], steps)
+    else:
+        Q, P0 = np.kron(together, model.Q), np.kron(shared, scenario.P0)
+    b = scenario.error
+    return World(
+        steps=steps,
+        F=tuple(f.F for f in filters),
+        H=tuple(s.H for s in sensors),
+        R=tuple(s.R for s in sensors),
+        Q=Q if scenario.process is None else scenario.process,
+        P0=P0,
+        correlation=None if scenario.noise is None else scenario.noise.correlation,
+        disturbance=None if scenario.noise is None else scenario.noise.disturbance,
+        error=None
+        if b is None
+        else np.concatenate([b if f.dimension == len(b) else np.linalg.pinv(f.M) @ b for f in filters]),
+        own=scenario.own,
+        relations=scenario.relations,
+        M=tuple(f.M for f in filters) if scenario.filters and not scenario.own else None,
+    )
+
+
+def _filter(scenario: Scenario) -> Filter:
+    d = scenario.model.dimension
+    return Filter(scenario.model.F, scenario.model.Q, scenario.P0, np.eye(d), np.zeros((d, 1)))
+
+
+def _stacked(blocks: Sequence[np.ndarray], steps: int) -> np.ndarray:
+    """Block diagonal matrix, per step where one of the blocks is."""
+    if any(block.ndim > 2 for block in blocks):
+        return np.stack([block_diag(*(at_step(block, step) for block in blocks)) for step in range(1, steps + 1)])
+    return block_diag(*blocks)
+
+
+def moments(estimate: Estimate | Moments) -> Moments:
     """Moments of the error from an estimate whose state is a noise footprint, x of shape (..., d, columns)."""
+    if isinstance(estimate, Moments):
+        return estimate
     noises, bias = estimate.x[..., :-1], estimate.x[..., -1:]
     return Moments.of(estimate.P, noises @ np.swapaxes(noises, -1, -2), bias)
 
 
-def claimed_only(estimate: Estimate) -> Moments:
+def claimed_only(estimate: Estimate | Moments) -> Moments:
     """Moments of an estimate whose error is not asked for."""
     return Moments(estimate.P)
 

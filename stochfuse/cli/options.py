@@ -32,6 +32,15 @@ class Estimator(StrEnum):
     local_fusion_graph = "local-fusion-graph"
     naive = "naive"
     optimal = "optimal"
+    covariance_intersection = "covariance-intersection"
+    split_ci = "split-ci"
+    blender = "blender"
+    joint_blender = "joint-blender"
+    equivalent_measurement = "equivalent-measurement"
+    independent_measurements = "independent-measurements"
+    lwin = "lwin"
+    itns = "itns"
+    stand_alone = "stand-alone"
 
 
 class Architecture(StrEnum):

@@ -17,7 +17,6 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from stochfuse.information import Ledger
-from stochfuse.kalman import Estimate
 
 
 class Late(NamedTuple):
@@ -111,10 +110,11 @@ class Claims(Protocol):
 
     width: int
 
-    def estimate(self, terms: Sequence[tuple[int, np.ndarray]], step: int) -> tuple[Estimate, float]:
+    def estimate(self, terms: Sequence[tuple[int, np.ndarray]], step: int) -> tuple[Any, float]:
         """Estimates of a step, Σ sign · value over (sign, values of any one shape), and by how much rounding grew.
 
-        P has shape (..., d, d); x (..., d, columns) holds data or a noise footprint, None where there is neither.
+        An `Estimate` of P (..., d, d) and x (..., d, columns), which holds data or a noise footprint or is None; or the
+        `Moments` of the error themselves.
         """
         ...
 

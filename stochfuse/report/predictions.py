@@ -29,6 +29,15 @@ ESTIMATOR_TITLES = {
     "optimal": ": the best that linear fusion can do with what arrived",
     "local-fusion-graph": " of the Local Fusion Graph",
     "naive": " of naive fusion (42)/(43)",
+    "covariance-intersection": " of covariance intersection",
+    "split-ci": " of split covariance intersection",
+    "blender": " of a tree of blenders",
+    "joint-blender": " of the joint blender",
+    "equivalent-measurement": " of the equivalent measurement",
+    "independent-measurements": " of measurements taken for independent",
+    "lwin": " of LWIN",
+    "itns": " of ITNS",
+    "stand-alone": " without fusion",
 }
 STATISTICS = {
     "variance": "variance over the outcomes of the {what}",

@@ -1,0 +1,107 @@
+"""Sensors heard over lossy links, fused into one equivalent measurement, then filtered once (theory section 9).
+
+What agents send is what they measured.  At every step an agent makes one measurement of its own and those that it
+hears, z̄ = A z with the bound R̄ (`stochfuse.fusion.equivalent_measurement`), and takes it into its own filter.  At step
+1 nothing has been measured, so that nothing is exchanged.  `IndependentMeasurements` does the same with R̄ as if all
+noises were independent and undisturbed.
+
+Nothing of an agent's error comes from another agent's estimate: footprints are not needed, its actual covariance goes
+on by itself,  (I − K̄H) A⁻ (I − K̄H)ᵀ + K̄ A (R + Δ) Aᵀ K̄ᵀ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from stochfuse.errors import UsageError
+from stochfuse.estimators.recursion import RecursiveEstimator, Rule, Worked
+from stochfuse.fusion.equivalent_measurement import (
+    Equivalent,
+    actual_error,
+    equivalent_measurement,
+    independent_measurement,
+)
+from stochfuse.kalman import Estimate, corrected, gain, predict
+from stochfuse.model import at_step
+
+MEASURED = "measured"
+
+
+class EquivalentMeasurement(RecursiveEstimator):
+    """The estimator; parameters are those of `RecursiveEstimator`, of which relabellings are not used."""
+
+    def __init__(self, world: Any, kinds: Sequence[int], relabellings: Any = None, *, errors: bool = False) -> None:
+        super().__init__(world, range(world.agents), None, errors=errors)
+        self._fused: dict[tuple[int, tuple[int, ...]], tuple[Equivalent, np.ndarray]] = {}
+        varying = [each.ndim > 2 for each in (*world.R, *world.H)]
+        self._varies = any(varying)
+        self._sees = [i for i in range(world.agents) if world.H[i].shape[-2]]
+        first = world.H[self._sees[0]] if self._sees else None
+        for i in self._sees:
+            if world.H[i].shape != first.shape or (world.H[i] != first).any():
+                raise UsageError(
+                    "equivalent measurement: expected sensors that measure the same (one H), got another H of agent "
+                    f"{i + 1}"
+                )
+
+    def fuse(self, step: int, agent: int, values: Sequence[int], heard: int, due: Sequence[int]) -> int:
+        """Value of the agent's estimate with all measurements heard."""
+        if step == 1:
+            return values[agent]
+        members = [j for j in sorted({agent, *self.neighbours(agent, heard)}) if j in self._sees]
+        return self.pasts.number(step, (MEASURED, agent, *members), (values[agent],))
+
+    def onward(self, step: int, agent: int, fused: int, before: int) -> int:
+        """The estimate itself: what is measured next is taken in with what is heard then."""
+        return fused
+
+    def first(self, rows: slice) -> Worked:
+        """First estimate, with its actual moments."""
+        P = self.world.P0[rows, rows][None]
+        if self.footprints is None:
+            return Worked(P)
+        b = np.zeros((P.shape[-1], 1)) if self.world.error is None else self.world.error[rows]
+        return Worked(P, actual=P, bias=b[None])
+
+    def work(self, step: int, rules: Sequence[Rule], rests_on: list[Worked]) -> Worked:
+        """Time update and one measurement."""
+        _, agent, *members = rules[0]
+        (before,), rows = rests_on, self.world.states[agent]
+        F, Q = at_step(self.world.F[agent], step), at_step(self.world.Q, step)[rows, rows]
+        prior = predict(Estimate(before.bias, before.P), F, Q)
+        truth = None if before.actual is None else predict(Estimate(None, before.actual), F, Q).P
+        if not members:
+            return Worked(prior.P, actual=truth, bias=prior.x)
+        H = at_step(self.world.H[members[0]], step)
+        fused, noise = self._measurement(step, tuple(members))
+        K = gain(prior.P, H, fused.R)
+        P = corrected(prior.P, K, H, fused.R)
+        if truth is None:
+            return Worked(P)
+        return Worked(P, actual=corrected(truth, K, H, noise), bias=prior.x - K @ (H @ prior.x))
+
+    def _measurement(self, step: int, members: tuple[int, ...]) -> tuple[Equivalent, np.ndarray]:
+        """Equivalent measurement of some sensors, and what its error covariance truly is."""
+        key = (step if self._varies else 0, members)
+        if key not in self._fused:
+            which = np.concatenate([np.arange(s.start, s.stop) for s in (self.world.measurements[j] for j in members)])
+            R = self.world.joint_noise(step)[np.ix_(which, which)]
+            Δ = None if self.world.disturbance is None else self.world.disturbance[np.ix_(which, which)]
+            fused = self.fused_measurement(R, len(members), Δ)
+            self._fused[key] = fused, actual_error(fused.weights, R, Δ)
+        return self._fused[key]
+
+    def fused_measurement(self, R: np.ndarray, sensors: int, disturbance: np.ndarray | None) -> Equivalent:
+        """One measurement for several, with the bound on its error."""
+        return equivalent_measurement(R, sensors, disturbance)
+
+
+class IndependentMeasurements(EquivalentMeasurement):
+    """The estimator; parameters are those of `EquivalentMeasurement`."""
+
+    def fused_measurement(self, R: np.ndarray, sensors: int, disturbance: np.ndarray | None) -> Equivalent:
+        """One measurement for several, whose noises are taken for independent and undisturbed."""
+        return independent_measurement(R, sensors)

@@ -1,0 +1,333 @@
+"""Estimators that remember pasts: what a fused estimate is made of is written down first, worked out in batches later.
+
+A value is a past: a step, a rule with the agents that it concerns, and the values that it rests on.  Equal pasts have
+equal numbers.  Between exchanges every agent's filter runs by itself,
+
+    local      predict (23)/(24), then update (25)–(27) with the agent's own measurement
+
+and what an agent makes of what it hears is the estimator's own business (`fuse` and `work`).  Errors ride along as
+noise footprints: the state of every estimate in a world whose true state is zero (`stochfuse.world`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from stochfuse.errors import UsageError
+from stochfuse.estimators import Late, Made, best_relabelling
+from stochfuse.kalman import Estimate, predict, update
+from stochfuse.model import at_step
+from stochfuse.quantities import Moments
+from stochfuse.world import Footprints, World
+
+Rule = tuple[Any, ...]
+"""Name of a rule, and the numbers of the agents that it concerns."""
+
+
+class Worked(NamedTuple):
+    """Stacks of estimates that a rule worked out.
+
+    Parameters
+    ----------
+    P : (..., d, d) claimed covariance.
+    x : (..., d, columns) noise footprint, or None.
+    independent : (..., d, d) part of P that only this step's own measurement brought, K R Kᵀ; None after fusion.
+    actual, bias : (..., d, d) actual covariance and (..., d, 1) mean error where no footprint is carried; or None.
+    """
+
+    P: Any
+    x: Any = None
+    independent: Any = None
+    actual: Any = None
+    bias: Any = None
+
+    def settled(self) -> Worked:
+        """Return the same with moments of the error in the place of the footprint, once nothing more rests on it."""
+        if self.x is None:
+            return Worked(self.P, actual=self.actual, bias=self.bias)
+        noises, bias = self.x[..., :-1], self.x[..., -1:]
+        return Worked(self.P, actual=noises @ np.swapaxes(noises, -1, -2), bias=bias)
+
+
+class Pasts:
+    """Numbers for distinct pasts; what a past rests on has smaller numbers.
+
+    Parameters
+    ----------
+    symmetric : names of the rules to which the order of what they rest on does not matter.
+    kinds : kind of each agent, where agents may change places with others of their kind.
+    """
+
+    def __init__(self, symmetric: Sequence[str] = (), kinds: Sequence[int] | None = None) -> None:
+        self.step: list[int] = []
+        self.rule: list[Rule] = []
+        self.rests_on: list[tuple[int, ...]] = []
+        self._symmetric = frozenset(symmetric)
+        self._number: dict[tuple[int, Rule, tuple[int, ...]], int] = {}
+        self._kinds = kinds
+        self._by_kind = None if kinds is None else Pasts(symmetric)
+        self._kind_of: dict[int, int] = {}
+        self._moved: dict[tuple[int, ...], dict[int, int]] = {}
+
+    def number(self, step: int, rule: Rule, rests_on: Sequence[int] = ()) -> int:
+        """Return the number of a past."""
+        key = (step, rule, tuple(sorted(rests_on) if rule[0] in self._symmetric else rests_on))
+        known = self._number.get(key)
+        if known is None:
+            known = self._number[key] = len(self.step)
+            self.step.append(step)
+            self.rule.append(rule)
+            self.rests_on.append(key[2])
+        return known
+
+    def invariant(self, number: int) -> int:
+        """Return a number that stays the same when agents of one kind change places."""
+        if self._by_kind is None or self._kinds is None:
+            return number
+        return self._renamed(number, self._by_kind, self._kinds, self._kind_of)
+
+    def moved(self, number: int, order: tuple[int, ...]) -> int:
+        """Return the number of the past after agents changed places: place p is taken by agent order[p]."""
+        if self._kinds is None:
+            return number
+        place = [0] * len(order)
+        for p, agent in enumerate(order):
+            place[agent] = p
+        return self._renamed(number, self, place, self._moved.setdefault(order, {}))
+
+    def _renamed(self, number: int, into: Pasts, names: Sequence[int], known: dict[int, int]) -> int:
+        new = known.get(number)
+        if new is None:
+            name, *agents = self.rule[number]
+            rests_on = [self._renamed(n, into, names, known) for n in self.rests_on[number]]
+            new = known[number] = into.number(self.step[number], (name, *(names[a] for a in agents)), rests_on)
+        return new
+
+    def batches(self, mixed: Sequence[str]) -> Iterator[tuple[int, list[Rule], np.ndarray]]:
+        """Pasts of one step and rule that rest on as many others, and on none of their own batch; in order of time.
+
+        Parameters
+        ----------
+        mixed : names of the rules that are worked out together whatever agents they concern.
+        """
+        level: list[int] = []
+        found: dict[tuple[int, int, Rule, int], list[int]] = {}
+        for number, (step, rule, rests_on) in enumerate(zip(self.step, self.rule, self.rests_on, strict=True)):
+            level.append(1 + max((level[n] for n in rests_on if self.step[n] == step), default=-1))
+            what = rule[:1] if rule[0] in mixed else rule
+            found.setdefault((step, level[number], what, len(rests_on)), []).append(number)
+        for key in sorted(found, key=lambda key: key[:2]):
+            yield key[0], [self.rule[number] for number in found[key]], np.array(found[key])
+
+
+class State(NamedTuple):
+    """Before an exchange: every agent's value, and (receiver, steps left, value) of messages under way."""
+
+    step: int
+    agents: tuple[int, ...]
+    late: tuple[tuple[int, int, int], ...] = ()
+
+
+class RecursiveEstimator:
+    """What estimators that remember pasts have in common; one of them says how to `fuse`, and how that `work`s out.
+
+    Parameters
+    ----------
+    world : what the filters are told, and what is true.
+    kinds : kind of each agent; agents of one kind may change places where the relabellings say so.
+    relabellings : permutations of the agents that leave network and world as they are; None if nobody may change.
+    errors : whether noise footprints are carried along.
+    """
+
+    additive, joint = False, False
+    symmetric: tuple[str, ...] = ()
+    mixed: tuple[str, ...] = ()
+    takes_late = False
+
+    def __init__(
+        self,
+        world: World,
+        kinds: Sequence[int],
+        relabellings: Sequence[tuple[int, ...]] | None = None,
+        *,
+        errors: bool = False,
+    ) -> None:
+        self.world, everyone = world, tuple(range(world.agents))
+        self.relabellings = relabellings or [everyone]
+        # where errors do not matter, the first agent of a kind stands for all of it
+        self.labels = everyone if errors else tuple(kinds.index(kind) for kind in kinds)
+        self.pasts = Pasts(self.symmetric, kinds if errors else None)
+        self.footprints = Footprints(world) if errors else None
+
+    def start(self) -> State:
+        """Everyone's first estimate."""
+        return State(1, tuple(self.pasts.number(1, ("start", label)) for label in self.labels))
+
+    def exchange(self, state: State) -> PastExchange:
+        """Open the exchange of the state's step."""
+        return PastExchange(self, state)
+
+    def fuse(self, step: int, agent: int, values: Sequence[int], heard: int, due: Sequence[int]) -> int:
+        """Value that an agent claims.
+
+        Parameters
+        ----------
+        values : what every agent has before the exchange.
+        heard : mask of the agents heard, itself included.
+        due : late messages that arrive now, brought forward.
+        """
+        raise NotImplementedError
+
+    def neighbours(self, agent: int, heard: int) -> list[int]:
+        """Others that were heard; of agents with states of their own, those that the agent can measure."""
+        others = [j for j in range(self.world.agents) if heard >> j & 1 and j != agent]
+        return [j for j in others if (agent, j) in self.world.relations] if self.world.own else others
+
+    def onward(self, step: int, agent: int, fused: int, before: int) -> int:
+        """What an agent has at the next step, of what it claims now and had before the exchange."""
+        return self.pasts.number(step + 1, ("local", self.labels[agent]), (fused,))
+
+    def work(self, step: int, rules: Sequence[Rule], rests_on: list[Worked]) -> Worked:
+        """Work a batch out, from stacks of what it rests on; all have one rule unless its name is in `mixed`."""
+        raise NotImplementedError
+
+    def make(self) -> Made:
+        """Return the estimator with its claims."""
+        return Made(self, lambda: PastClaims(self))
+
+    def batch(self, step: int, rules: Sequence[Rule], rests_on: list[Worked]) -> Worked:
+        """Work out the rules that all estimators share, and leave the others to `work`."""
+        rule = rules[0]
+        if rule[0] == "start":
+            return self.first(self.world.states[rule[1]])
+        if rule[0] == "local":
+            return self.local(step, rule[1], rests_on[0])
+        if rule[0] == "forward":
+            prior = self.prior(step, rule[1], rests_on[0])
+            return Worked(prior.P, prior.x, np.zeros_like(prior.P))
+        return self.work(step, rules, rests_on)
+
+    def first(self, rows: slice) -> Worked:
+        """First estimate of some rows of the stacked state, as a batch of one."""
+        P = self.world.P0[rows, rows][None]
+        return Worked(P, None if self.footprints is None else self.footprints.start(rows)[None], np.zeros_like(P))
+
+    def prior(self, step: int, agent: int, before: Worked) -> Estimate:
+        """Time update of an agent's estimates."""
+        rows = self.world.states[agent]
+        moved = None if self.footprints is None else self.footprints.process(step, rows)
+        Q = at_step(self.world.Q, step)[rows, rows]
+        return predict(Estimate(before.x, before.P), at_step(self.world.F[agent], step), Q, moved)
+
+    def local(self, step: int, agent: int, before: Worked) -> Worked:
+        """Time update and the agent's own measurement."""
+        H, R = at_step(self.world.H[agent], step), at_step(self.world.R[agent], step)
+        z = None if self.footprints is None else self.footprints.measured(step, agent)
+        x, P = update(self.prior(step, agent, before), H, R, z)
+        return Worked(P, x, P @ (H.T @ np.linalg.solve(R, H)) @ P)
+
+
+class PastExchange:
+    """One exchange."""
+
+    def __init__(self, estimator: RecursiveEstimator, state: State) -> None:
+        self.estimator, self.state = estimator, state
+        self._due: list[list[int]] = [[] for _ in state.agents]
+        for receiver, left, value in state.late:
+            if left == 0:
+                self._due[receiver].append(value)
+
+    def fused(self, agent: int, heard: Sequence[int]) -> int:
+        """Value that an agent claims after everyone heard some, with what else is due."""
+        step, agents, _ = self.state
+        return self.estimator.fuse(step, agent, agents, heard[agent], self._due[agent])
+
+    def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[State, tuple[int, ...]]:
+        """State before the next exchange, in the order that like states share, and the agent at each place of it."""
+        step, agents, under_way = self._next(heard, late)
+        pasts, relabellings = self.estimator.pasts, self.estimator.relabellings
+        if len(relabellings) == 1:
+            return State(step, agents, under_way), relabellings[0]
+        invariants = [
+            (pasts.invariant(agents[i]), sorted((left, pasts.invariant(v)) for r, left, v in under_way if r == i))
+            for i in range(len(agents))
+        ]
+        states = []
+        for order in best_relabelling(invariants, relabellings):
+            place = {i: p for p, i in enumerate(order)}
+            late_now = tuple(sorted((place[r], left, pasts.moved(value, order)) for r, left, value in under_way))
+            states.append((State(step, tuple(pasts.moved(agents[i], order) for i in order), late_now), order))
+        return min(states)
+
+    def onward(self, heard: Sequence[int], late: Sequence[Late] = ()) -> PastExchange:
+        """Open the next exchange as it comes."""
+        return self.estimator.exchange(self._next(heard, late))
+
+    def _next(self, heard: Sequence[int], late: Sequence[Late]) -> State:
+        step, before, under_way = self.state
+        estimator = self.estimator
+        agents = tuple(estimator.onward(step, i, self.fused(i, heard), value) for i, value in enumerate(before))
+        coming = [(r, left - 1, value) for r, left, value in under_way if left > 0]
+        coming += [(m.receiver, m.delay - 1, before[m.sender]) for m in late]
+        forward = [
+            (r, left, estimator.pasts.number(step + 1, ("forward", estimator.labels[r]), (value,)))
+            for r, left, value in coming
+        ]
+        return State(step + 1, agents, tuple(sorted(forward)))
+
+
+class PastClaims:
+    """What pasts claim, in numbers."""
+
+    def __init__(self, estimator: RecursiveEstimator) -> None:
+        self._worked: list[Worked] = []
+        self._batch = np.zeros(len(estimator.pasts.step), dtype=int)
+        self._row = np.zeros(len(estimator.pasts.step), dtype=int)
+        steps: list[int] = []
+        for step, rules, numbers in estimator.pasts.batches(estimator.mixed):
+            if steps and step > steps[-1]:
+                self._settle([b for b, s in enumerate(steps) if s == step - 2])
+            steps.append(step)
+            rests_on = np.array([estimator.pasts.rests_on[n] for n in numbers], dtype=int).reshape(len(numbers), -1)
+            worked = estimator.batch(step, rules, [self._gathered(column) for column in rests_on.T])
+            if not np.isfinite(worked.P).all():
+                raise UsageError(f"step {step}: the covariance of {rules[0][0]} grows beyond floating point")
+            self._batch[numbers], self._row[numbers] = len(self._worked), np.arange(len(numbers))
+            self._worked.append(worked)
+        self._settle([b for b, s in enumerate(steps) if s >= steps[-1] - 1])
+        self.width = self._worked[-1].P[0].size
+
+    def estimate(self, terms: Sequence[tuple[int, np.ndarray]], step: int) -> tuple[Estimate | Moments, float]:
+        """Estimates of a step, with the moments of their errors if these were carried along; nothing is summed."""
+        ((_, values),) = terms
+        used, index = np.unique(values, return_inverse=True)
+        found, index = self._gathered(used), index.reshape(np.shape(values))
+        if found.actual is None:
+            return Estimate(None, found.P[index]), 1.0
+        return Moments.of(found.P, found.actual, found.bias).map(lambda m: m[index]), 1.0
+
+    def _settle(self, batches: Sequence[int]) -> None:
+        """Keep of batches that nothing more rests on what may be claimed: footprints are large."""
+        for batch in batches:
+            self._worked[batch] = self._worked[batch].settled()
+
+    def _gathered(self, numbers: np.ndarray) -> Worked:
+        batches = np.unique(self._batch[numbers])
+        if len(batches) == 1:
+            chosen = self._row[numbers]
+            return Worked(*(None if a is None else a[chosen] for a in self._worked[batches[0]]))
+        return Worked(*(self._filled(place, numbers, batches) for place in range(len(Worked._fields))))
+
+    def _filled(self, place: int, numbers: np.ndarray, batches: np.ndarray) -> np.ndarray | None:
+        parts = [self._worked[batch][place] for batch in batches]
+        if any(part is None for part in parts):
+            return None
+        first = parts[0]
+        out = np.empty((len(numbers), *first.shape[1:]))
+        for batch, part in zip(batches, parts, strict=True):
+            here = self._batch[numbers] == batch
+            out[here] = part[self._row[numbers[here]]]
+        return out
