@@ -63,6 +63,12 @@ def matrix(quantity: str, moments: Moments) -> Any:
     return getattr(moments, _FIELD[quantity])
 
 
+def needed(quantity: str, moments: Moments) -> Moments:
+    """Return only the moments that a quantity's value is made of."""
+    fields = ("P", "actual") if quantity == "consistency" else (_FIELD[quantity],)
+    return Moments(*(m if field in fields else None for field, m in zip(Moments._fields, moments, strict=True)))
+
+
 def value(quantity: str, metric: Metric, moments: Moments) -> np.ndarray:
     """Return a quantity as one number each, (...,), in the metric's sense.
 

@@ -21,7 +21,7 @@ from stochfuse.events import events, relabellings
 from stochfuse.general import groups_alike
 from stochfuse.metrics import Metric
 from stochfuse.network import LinkRows
-from stochfuse.quantities import Moments, value
+from stochfuse.quantities import Moments, needed, value
 from stochfuse.rules import make
 from stochfuse.scenario import Scenario
 from stochfuse.sources import claimed_only, moments
@@ -54,22 +54,19 @@ class Sampled:
 
     def moments(self) -> Moments:
         """Mean moments per group, (rows, steps, groups, …)."""
-        return self.sample.values.map(self._mean)
-
-    def _mean(self, values: np.ndarray) -> np.ndarray:
-        index = self.sample.which
-        out = np.empty((index.shape[0], index.shape[2], len(self.groups), *values.shape[1:]))
-        for g, agents in enumerate(self.groups):
-            for row in range(len(index)):
-                for step in range(index.shape[2]):
-                    counts = np.bincount(index[row, :, step][:, list(agents)].ravel(), minlength=len(values))
-                    used = np.flatnonzero(counts)
-                    out[row, step, g] = np.tensordot(counts[used], values[used], axes=1) / counts.sum()
-        return out
+        values, index = self.sample
+        shape = (index.shape[0], index.shape[2], len(self.groups))
+        means = values.map(lambda m: np.empty((*shape, *m.shape[1:])))
+        for row, step, g in np.ndindex(shape):
+            used, counts = np.unique(index[row, :, step][:, list(self.groups[g])], return_counts=True)
+            for mean, each in zip(means, values, strict=True):
+                if each is not None:
+                    mean[row, step, g] = np.tensordot(counts, each[used], axes=1) / counts.sum()
+        return means
 
     def standard_error(self, metric: Metric, agents: tuple[int, ...], quantity: str = "claimed") -> np.ndarray:
         """Standard error of a quantity of the mean over some agents, (rows, steps)."""
-        values, index = self.sample
+        values, index = needed(quantity, self.sample.values), self.sample.which
         out = np.empty((index.shape[0], index.shape[2]))
         for row in range(len(index)):
             for step in range(index.shape[2]):

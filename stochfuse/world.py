@@ -81,7 +81,7 @@ class World:
         for i, (rows, Li) in enumerate(zip(self.measurements, roots, strict=True)):
             for j, (columns, Lj) in enumerate(zip(self.measurements, roots, strict=True)):
                 c = float(i == j) if self.correlation is None else self.correlation[i, j]
-                if c:
+                if c and Li.size and Lj.size:
                     out[rows, columns] = c * Li @ Lj.T
         return out
 

@@ -149,6 +149,15 @@ def test_filters_that_differ_in_one_direction_alone():
     np.testing.assert_allclose(got.weights[1] @ u, 0.4 * u, rtol=1e-10)
 
 
+def test_what_differs_little_is_still_blended():
+    """e_1 = c + a, e_2 = c + b with c ten thousand times as large as a and b: P is c's with a and b blended."""
+    rng = np.random.default_rng(18)
+    common, A, B = 1e8 * covariance(rng, 2), covariance(rng, 2) + np.eye(2), covariance(rng, 2) + np.eye(2)
+    got = blend(common + A, common + B, common)
+    np.testing.assert_allclose(got.weights[1], A @ np.linalg.inv(A + B), rtol=1e-5)
+    np.testing.assert_allclose(got.P - common, A @ np.linalg.inv(A + B) @ B, rtol=1e-5)
+
+
 def test_a_useless_filter_does_not_spoil_the_others():
     good = covariance(np.random.default_rng(8), 4) + np.eye(4)
     J = np.zeros((6, 6))
@@ -234,7 +243,7 @@ def test_cross_recursion_against_two_real_filters_sampled():
 def test_cross_covariance_is_that_of_the_joint_recursion():
     full, short, Q_cross, R_cross, P0_cross = navigators()
     run = parallel_filters([full, short], 4, Q_cross, R_cross, P0_cross)
-    P12 = P0_cross[0, 1]
+    P12, K1, K2 = P0_cross[0, 1], run.gains[0][1], run.gains[1][1]
     for k in range(1, 4):
         K1, K2 = run.gains[0][k], run.gains[1][k]
         P12 = cross_covariance(P12, full.F, short.F, Q_cross[0, 1], K1, full.H, K2, short.H, R_cross[1, 0].T)
@@ -259,7 +268,8 @@ def test_shaped_estimates_and_a_mapping_without_a_direction():
 
 def test_matrices_per_step():
     constant = parallel_filters([SCALAR, SCALAR], 3, Q_cross={(0, 1): ONE})
-    stacked = ParallelFilter(*(np.broadcast_to(ONE, (3, 1, 1)) for _ in range(4)), ONE, np.ones((3, 1, 1)))
+    each = np.broadcast_to(ONE, (3, 1, 1))
+    stacked = ParallelFilter(each, each, each, each, ONE, each, 0 * each)
     varying = parallel_filters([SCALAR, stacked], 3, Q_cross={(1, 0): np.ones((3, 1, 1))})
     np.testing.assert_array_equal(constant.joint, varying.joint)
     R = np.array([9.0, 1.0, 4.0])[:, None, None]
@@ -330,7 +340,10 @@ def test_crosses_that_do_not_fit(cross, message):
         (lambda: blend_all(THREE, 3, [1, 3]), r"arrived: expected at least one of the filters 0 to 2, got \[1, 3\]"),
         (lambda: blend_tree(THREE, 3, ((0, 1), 1)), "tree: expected each of 0, 1, 2 once, got 0, 1, 1"),
         (lambda: blend_tree(THREE, 3, (0, 1)), "tree: expected each of 0, 1, 2 once, got 0, 1"),
-        (lambda: blend_tree(THREE, 3, (0, 1, 2)), r"tree: expected nested pairs such as .* got \(0, 1, 2\)"),
+        (
+            lambda: blend_tree(THREE, 3, (0, 1, 2)),  # pyright: ignore[reportArgumentType]
+            r"tree: expected nested pairs such as .* got \(0, 1, 2\)",
+        ),
         (lambda: semidefinite("X", np.ones((2, 3))), "X: expected a positive semi-definite matrix, got one of 2×3"),
         (lambda: semidefinite("X", np.array([[1.0, 0], [0.1, 1]])), "X: .*, got an asymmetric one"),
         (lambda: semidefinite("X", np.array([[np.inf]])), r"X: .*, got a value that is not finite \(NaN or infinity\)"),

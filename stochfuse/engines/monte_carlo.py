@@ -159,9 +159,12 @@ def _kept(experiment: Experiment, claims: Claims, claimed: np.ndarray) -> Any:
         values = np.unique(claimed[:, step - 1])
         parts.append(experiment.of(claims.estimate([(1, values)], step)[0]))
         order.append(values)
-    place = np.argsort(np.concatenate(order))
     columns = zip(*parts, strict=True)
-    return type(parts[0])(*(None if c[0] is None else np.concatenate(c)[place] for c in columns))
+    kept = type(parts[0])(*(None if c[0] is None else np.concatenate(c) for c in columns))
+    place = np.argsort(np.concatenate(order))
+    if (place == np.arange(len(place))).all():  # most estimators number their values in order of time
+        return kept
+    return type(kept)(*(None if c is None else c[place] for c in kept))
 
 
 class _Histories:

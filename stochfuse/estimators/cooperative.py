@@ -2,8 +2,8 @@
 
 LWIN (local, with immediate neighbours): agent i takes what it measured of each neighbour into its own estimate, with
 the neighbour's claimed covariance as noise.  ITNS (integrated total network solution): a centre keeps one covariance
-for all agents, and every local and cooperative measurement corrects all of them.  A cooperative measurement y_ij is there
-if agent i hears agent j.  All measurements of a step use the estimates from before the exchange.
+for all agents, and every local and cooperative measurement corrects all of them.  A cooperative measurement y_ij is
+there if agent i hears agent j.  All measurements of a step use the estimates from before the exchange.
 
 Where all agents track one state there is nothing to measure between them; agreement itself, x_i − x_j = 0, takes the
 place of a cooperative measurement (H_i = I, H_j = −I, R = 0).  LWIN is then naive fusion (42)/(43).  ITNS then takes
@@ -88,11 +88,11 @@ class Itns(RecursiveEstimator):
                 return Worked(joint.P[:, rows, rows])
             return Worked(joint.P[:, rows, rows], actual=joint.actual[:, rows, rows], bias=joint.bias[:, rows])
         joint = self._exchanged(step, rules, rests_on[0])
-        return joint.settled() if self.footprints is not None else joint
+        return joint.settled() if self.errors else joint
 
     def _first(self) -> Worked:
         world = self.world
-        if self.footprints is None:
+        if not self.errors:
             return Worked(world.P0[None])
         b = np.zeros((len(world.P0), 1)) if world.error is None else world.error
         return Worked(world.P0[None], self._with_columns(1, factor(world.P0)[None], b[None])[0])
@@ -106,7 +106,7 @@ class Itns(RecursiveEstimator):
         for rows, own in zip(world.measurements, world.R, strict=True):
             R[rows, rows] = at_step(own, step)
         x, w, v = None, None, None
-        if self.footprints is not None:
+        if self.errors:
             x, (w, v) = self._with_columns(
                 step,
                 factor(before.actual),

@@ -36,6 +36,7 @@ class EquivalentMeasurement(RecursiveEstimator):
     def __init__(self, world: Any, kinds: Sequence[int], relabellings: Any = None, *, errors: bool = False) -> None:
         super().__init__(world, range(world.agents), None, errors=errors)
         self._fused: dict[tuple[int, tuple[int, ...]], tuple[Equivalent, np.ndarray]] = {}
+        self._rules: dict[tuple[int, int], Rule] = {}
         varying = [each.ndim > 2 for each in (*world.R, *world.H)]
         self._varies = any(varying)
         self._sees = [i for i in range(world.agents) if world.H[i].shape[-2]]
@@ -51,8 +52,11 @@ class EquivalentMeasurement(RecursiveEstimator):
         """Value of the agent's estimate with all measurements heard."""
         if step == 1:
             return values[agent]
-        members = [j for j in sorted({agent, *self.neighbours(agent, heard)}) if j in self._sees]
-        return self.pasts.number(step, (MEASURED, agent, *members), (values[agent],))
+        rule = self._rules.get((agent, heard))
+        if rule is None:
+            members = [j for j in sorted({agent, *self.neighbours(agent, heard)}) if j in self._sees]
+            rule = self._rules[agent, heard] = (MEASURED, agent, *members)
+        return self.pasts.number(step, rule, (values[agent],))
 
     def onward(self, step: int, agent: int, fused: int, before: int) -> int:
         """The estimate itself: what is measured next is taken in with what is heard then."""
@@ -61,7 +65,7 @@ class EquivalentMeasurement(RecursiveEstimator):
     def first(self, rows: slice) -> Worked:
         """First estimate, with its actual moments."""
         P = self.world.P0[rows, rows][None]
-        if self.footprints is None:
+        if not self.errors:
             return Worked(P)
         b = np.zeros((P.shape[-1], 1)) if self.world.error is None else self.world.error[rows]
         return Worked(P, actual=P, bias=b[None])

@@ -12,6 +12,7 @@ noise footprints: the state of every estimate in a world whose true state is zer
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -160,7 +161,13 @@ class RecursiveEstimator:
         # where errors do not matter, the first agent of a kind stands for all of it
         self.labels = everyone if errors else tuple(kinds.index(kind) for kind in kinds)
         self.pasts = Pasts(self.symmetric, kinds if errors else None)
-        self.footprints = Footprints(world) if errors else None
+        self.errors = errors
+        self._neighbours: dict[tuple[int, int], tuple[int, ...]] = {}
+
+    @cached_property
+    def footprints(self) -> Footprints | None:
+        """Noise footprints, where errors are carried along; large, and so not made before they are asked for."""
+        return Footprints(self.world) if self.errors else None
 
     def start(self) -> State:
         """Everyone's first estimate."""
@@ -181,10 +188,14 @@ class RecursiveEstimator:
         """
         raise NotImplementedError
 
-    def neighbours(self, agent: int, heard: int) -> list[int]:
+    def neighbours(self, agent: int, heard: int) -> tuple[int, ...]:
         """Others that were heard; of agents with states of their own, those that the agent can measure."""
-        others = [j for j in range(self.world.agents) if heard >> j & 1 and j != agent]
-        return [j for j in others if (agent, j) in self.world.relations] if self.world.own else others
+        known = self._neighbours.get((agent, heard))
+        if known is None:
+            others = [j for j in range(self.world.agents) if heard >> j & 1 and j != agent]
+            known = tuple(j for j in others if not self.world.own or (agent, j) in self.world.relations)
+            self._neighbours[agent, heard] = known
+        return known
 
     def onward(self, step: int, agent: int, fused: int, before: int) -> int:
         """What an agent has at the next step, of what it claims now and had before the exchange."""
@@ -235,6 +246,7 @@ class PastExchange:
 
     def __init__(self, estimator: RecursiveEstimator, state: State) -> None:
         self.estimator, self.state = estimator, state
+        self._fused: dict[tuple[int, int], int] = {}
         self._due: list[list[int]] = [[] for _ in state.agents]
         for receiver, left, value in state.late:
             if left == 0:
@@ -242,8 +254,12 @@ class PastExchange:
 
     def fused(self, agent: int, heard: Sequence[int]) -> int:
         """Value that an agent claims after everyone heard some, with what else is due."""
-        step, agents, _ = self.state
-        return self.estimator.fuse(step, agent, agents, heard[agent], self._due[agent])
+        known = self._fused.get((agent, heard[agent]))
+        if known is None:
+            step, agents, _ = self.state
+            known = self.estimator.fuse(step, agent, agents, heard[agent], self._due[agent])
+            self._fused[agent, heard[agent]] = known
+        return known
 
     def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[State, tuple[int, ...]]:
         """State before the next exchange, in the order that like states share, and the agent at each place of it."""
@@ -305,9 +321,10 @@ class PastClaims:
         ((_, values),) = terms
         used, index = np.unique(values, return_inverse=True)
         found, index = self._gathered(used), index.reshape(np.shape(values))
-        if found.actual is None:
-            return Estimate(None, found.P[index]), 1.0
-        return Moments.of(found.P, found.actual, found.bias).map(lambda m: m[index]), 1.0
+        moments = Moments(found.P) if found.actual is None else Moments.of(found.P, found.actual, found.bias)
+        if not np.array_equal(used, values):
+            moments = moments.map(lambda m: m[index])
+        return (Estimate(None, moments.P) if found.actual is None else moments), 1.0
 
     def _settle(self, batches: Sequence[int]) -> None:
         """Keep of batches that nothing more rests on what may be claimed: footprints are large."""

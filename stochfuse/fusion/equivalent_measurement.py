@@ -9,6 +9,9 @@ the disturbances δ only a bound E[δδᵀ] ≤ Δ is known, and nothing of thei
 
 with ε chosen to minimise tr R̄.
 
+The bound holds for each z̄ by itself.  A filter that takes R̄ for white noise averages it down over time, which is right
+for disturbances that come anew with every measurement and too good for one that persists.
+
 The optimum is global.  Put t = 1/(1 + ε); then (1 + ε) a + (1 + 1/ε) b = a/t + b/(1 − t), and
 
     φ(A, t) = tr(A R Aᵀ)/t + tr(A Δ Aᵀ)/(1 − t)
@@ -40,7 +43,6 @@ from scipy.optimize import root_scalar
 from stochfuse.algebra import NUMPY
 from stochfuse.errors import NoAnswerError, UsageError
 from stochfuse.fusion.blender import RANK, blend_all, references, semidefinite, spectrum
-from stochfuse.kalman import factor
 
 REACH = 1e8
 """Largest factor between ε and √(tr Δ / tr R) for which it is sought."""
@@ -139,7 +141,7 @@ def actual_error(weights: np.ndarray, R: np.ndarray, disturbance: np.ndarray | N
 def worst_error(weights: np.ndarray, R: np.ndarray, Delta: np.ndarray) -> np.ndarray:
     """Error covariance of z̄, (..., p, p), for the correlation of δ with v that makes its trace largest, E[δδᵀ] = Δ.
 
-    With A R Aᵀ = L Lᵀ, A Δ Aᵀ = M Mᵀ and LᵀM = U Σ Vᵀ it is (L + M V Uᵀ)(L + M V Uᵀ)ᵀ, of trace
+    With A R Aᵀ = L Lᵀ, A Δ Aᵀ = M Mᵀ and LᵀM = U Σ Vᵀ it is that of L w + M V Uᵀ w with white w, of trace
     tr A R Aᵀ + tr A Δ Aᵀ + 2 tr Σ: never above the claimed tr R̄, and equal to it where p = 1.
 
     Parameters
@@ -147,7 +149,7 @@ def worst_error(weights: np.ndarray, R: np.ndarray, Delta: np.ndarray) -> np.nda
     weights : (..., p, n·p) A.
     R, Delta : (..., n·p, n·p) covariance of v and bound on that of δ.
     """
-    L, M = (factor(actual_error(weights, covariance)) for covariance in (R, Delta))
+    L, M = (weights @ _square_root(covariance) for covariance in (R, Delta))
     U, _, Vt = np.linalg.svd(NUMPY.transpose(L) @ M)
     together = L + M @ NUMPY.transpose(Vt) @ NUMPY.transpose(U)
     return NUMPY.symmetric(together @ NUMPY.transpose(together))
@@ -218,8 +220,9 @@ def _scaled(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _square_root(C: np.ndarray) -> np.ndarray:
     """L with C = L Lᵀ, rounding of a singular C left out: A C Aᵀ from it can be as small as the squares of rounding."""
-    values, vectors, scale = spectrum(C, np.diagonal(C))
-    return vectors * np.sqrt(np.where(values > 1e-15 * len(C), values, 0.0)) / scale[:, None]
+    values, vectors, scale = spectrum(C, np.diagonal(C, axis1=-2, axis2=-1))
+    kept = np.sqrt(np.where(values > 1e-15 * C.shape[-1], values, 0.0))
+    return vectors * kept[..., None, :] / scale[..., :, None]
 
 
 def _slope(A: np.ndarray, log_epsilon: float, v: np.ndarray, d: np.ndarray) -> float:

@@ -32,7 +32,7 @@ EQUAL = 2e-15
 
 
 class Pairs(NamedTuple):
-    """N pairs: T (N, d, d), and α, β, δ = β − α (N, d)."""
+    """N pairs: T (N, d, d), empty where it was not asked for, and α, β, δ = β − α (N, d)."""
 
     T: np.ndarray
     alpha: np.ndarray
@@ -65,11 +65,17 @@ def pair_weights(A: np.ndarray, B: np.ndarray, criterion: str = "det") -> np.nda
         raise UsageError(
             f"pairs: expected stacks A and B of N square matrices each, got shapes {A.shape} and {B.shape}"
         )
-    return weights_of(diagonalise(A, B), criterion)
+    return weights_of(diagonalise(A, B, basis=criterion == "trace"), criterion)
 
 
-def diagonalise(A: np.ndarray, B: np.ndarray) -> Pairs:
-    """Bring each pair to diagonal form; UsageError if a matrix is indefinite or a sum singular."""
+def diagonalise(A: np.ndarray, B: np.ndarray, *, basis: bool = True) -> Pairs:
+    """Bring each pair to diagonal form, T only if the basis is wanted.
+
+    Raises
+    ------
+    UsageError
+        If a matrix is indefinite or a sum singular.
+    """
     total = A + B
     diagonal = np.diagonal(total, axis1=-2, axis2=-1)
     scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
@@ -79,11 +85,16 @@ def diagonalise(A: np.ndarray, B: np.ndarray) -> Pairs:
     except np.linalg.LinAlgError:
         raise UsageError("pairs: expected positive definite sums A + B, got a singular or indefinite one") from None
     whiten = np.linalg.inv(L) / columns
-    delta, U = np.linalg.eigh(NUMPY.symmetric(whiten @ (B - A) @ NUMPY.transpose(whiten)))
+    difference = NUMPY.symmetric(whiten @ (B - A) @ NUMPY.transpose(whiten))
+    if basis:
+        delta, U = np.linalg.eigh(difference)
+        T = rows * (L @ U)
+    else:
+        delta, T = np.linalg.eigvalsh(difference), np.empty((len(A), 0, 0))
     if delta.size and np.abs(delta).max() > 1.0 + 1e-6:
         raise UsageError("pairs: expected positive semi-definite matrices, got an indefinite one")
     delta = np.clip(delta, -1.0, 1.0)
-    return Pairs(rows * (L @ U), 0.5 * (1.0 - delta), 0.5 * (1.0 + delta), delta)
+    return Pairs(T, 0.5 * (1.0 - delta), 0.5 * (1.0 + delta), delta)
 
 
 def weights_of(pairs: Pairs, name: str) -> np.ndarray:

@@ -65,7 +65,7 @@ class Directions(NamedTuple):
 
 
 class Slopes(NamedTuple):
-    """Value (N,), gradient (N, m), Hessian (N, m, m) of the criterion, and what the certificate needs."""
+    """Value (N,), gradient (N, m), Hessian (N, m, m), what the certificate needs, and the gradient at ω_i = 0."""
 
     value: np.ndarray
     gradient: np.ndarray
@@ -74,6 +74,7 @@ class Slopes(NamedTuple):
     Z: np.ndarray
     u: np.ndarray
     first: np.ndarray
+    at_zero: np.ndarray
 
 
 def share(alpha: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -151,7 +152,8 @@ def slopes_at(directions: Directions, E: np.ndarray, criterion: Criterion, weigh
         hessian += (blocks(gram * gram) - across[:, :, None] * across[:, None, :] / square(Z)) / mu
     else:
         hessian += _norm_curvature(criterion, S, value, u, first, m)
-    return Slopes(value, -by_signal(first * own, m), NUMPY.symmetric(hessian), S, Z, u, first)
+    at_zero = np.where(alpha > 0, own.reshape(N, m, p) / np.where(alpha > 0, alpha, 1.0), 0.0)
+    return Slopes(value, -by_signal(first * own, m), NUMPY.symmetric(hessian), S, Z, u, first, -at_zero.sum(axis=-1))
 
 
 def _norm_curvature(

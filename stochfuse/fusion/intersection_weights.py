@@ -29,7 +29,7 @@ from stochfuse.fusion.intersection_slopes import (
 FINE = 2e-6
 """µ of the largest eigenvalue, relative to its size at equal weights, from which on weights are worth keeping."""
 SETTLED = 1e-13
-"""Newton step in ω that ends the search."""
+"""Newton step, in units of the weights, that ends the search."""
 NOISE = 4e-15
 """Slope, in units of the criterion, that is taken for rounding: along it the criterion is flat."""
 SINGULAR = 2e-15
@@ -122,8 +122,8 @@ def _value(directions: Directions, E: np.ndarray, criterion: Criterion, weights:
     return np.where(bounded, measure(criterion, S, mu)[0], np.inf)
 
 
-def _newton(slopes: Slopes, weights: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Newton step on each problem's face, zero along flat directions.
+def _newton(slopes: Slopes, weights: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Newton step (N, m) on each problem's face, zero along flat directions, and its size (N,) in units of the weights.
 
     Each weight is measured in a unit of its own, its size or the range over which its slope would change the
     criterion by one, so that a nearly exact signal, whose weight matters at 1e-12, is no stiffer than others.
@@ -138,7 +138,8 @@ def _newton(slopes: Slopes, weights: np.ndarray, free: np.ndarray) -> np.ndarray
     along = (NUMPY.transpose(axes) @ slope[..., None])[..., 0]
     stiff = np.maximum(curvature, 1e-13 * np.maximum(curvature[:, -1:], 1e-3))
     step = np.where(np.abs(along) > NOISE * slopes.S.shape[-1], -along / stiff, 0.0)
-    return unit * (axes @ step[..., None])[..., 0]
+    scaled = (axes @ step[..., None])[..., 0]
+    return unit * scaled, np.abs(scaled).max(axis=-1)
 
 
 def _descend(
@@ -156,8 +157,7 @@ def _descend(
     for _ in range(MOST_STEPS):
         part, selected = _cut(directions, moving), E[moving]
         slopes = slopes_at(part, selected, criterion, weights[moving], mu)
-        step = _newton(slopes, weights[moving], free[moving])
-        size = np.abs(step).max(axis=-1)
+        step, size = _newton(slopes, weights[moving], free[moving])
         small[moving] = np.where(size < 1e-8, small[moving] + 1, 0)
         settled = (size <= SETTLED) | (small[moving] > 3)
         new, blocked, moved = _search(part, selected, criterion, weights[moving], step, slopes, mu)
@@ -196,8 +196,12 @@ def _search(
     """
     downhill = step < 0
     reach = np.where(downhill, -weights / np.where(downhill, step, -1.0), np.inf)
+    # a nearly exact signal is needed although its weight is too great: shrink it, for zero would lose it
+    level = (weights * slopes.gradient).sum(axis=-1, keepdims=True)
+    needed = (slopes.at_zero < np.minimum(level, 2.0 * slopes.gradient)) & (weights > 0)
+    reach = np.where(needed, 0.98 * reach, reach)
     length = np.minimum(1.0, reach.min(axis=-1))
-    blocking = reach <= length[:, None]
+    blocking = (reach <= length[:, None]) & ~needed
     promised = (slopes.gradient * step).sum(axis=-1)
     new, blocked = weights.copy(), np.zeros(weights.shape, dtype=bool)
     pending = np.arange(len(weights))
@@ -232,7 +236,7 @@ def _residual(
     missing = 0.0
     size = 1.0 if criterion.name == "det" else measure(criterion, slopes.S, 0.0)[0]
     if criterion.name == "max-eig":
-        Z = _dual(slopes, _newton(slopes, weights, weights > 0), mu)
+        Z = _dual(slopes, _newton(slopes, weights, weights > 0)[0], mu)
         gradient = -by_signal(slopes.first * (slopes.u * (Z @ slopes.u)).sum(axis=1), weights.shape[-1])
         missing = size - (Z * slopes.S).sum(axis=(-2, -1))
     gap = (weights * gradient).sum(axis=-1) - gradient.min(axis=-1)
