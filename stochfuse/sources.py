@@ -111,8 +111,8 @@ def _filter(scenario: Scenario) -> Filter:
 def _stacked(blocks: Sequence[np.ndarray], steps: int) -> np.ndarray:
     """Block diagonal matrix, per step where one of the blocks is."""
     if any(block.ndim > 2 for block in blocks):
-        return np.stack([block_diag(*(at_step(block, step) for block in blocks)) for step in range(1, steps + 1)])
-    return block_diag(*blocks)
+        return np.array([block_diag(*(at_step(block, step) for block in blocks)) for step in range(1, steps + 1)])
+    return np.asarray(block_diag(*blocks))
 
 
 def moments(estimate: Estimate | Moments) -> Moments:

@@ -51,7 +51,8 @@ class Lwin(RecursiveEstimator):
         _, agent, *others = rules[0]
         for j, neighbour in zip(others, neighbours, strict=True):
             z = None if self.footprints is None else self.footprints.related(step, (agent, j))
-            own = lwin_update(own, neighbour, *(at_step(M, step) for M in self.world.relations[agent, j]), z)
+            H_i, H_j, R = (at_step(M, step) for M in self.world.relations[agent, j])
+            own = lwin_update(own, neighbour, H_i, H_j, R, z)
         return Worked(own.P, own.x)
 
 

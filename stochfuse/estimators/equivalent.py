@@ -40,12 +40,12 @@ class EquivalentMeasurement(RecursiveEstimator):
         varying = [each.ndim > 2 for each in (*world.R, *world.H)]
         self._varies = any(varying)
         self._sees = [i for i in range(world.agents) if world.H[i].shape[-2]]
-        first = world.H[self._sees[0]] if self._sees else None
         for i in self._sees:
+            first = world.H[self._sees[0]]
             if world.H[i].shape != first.shape or (world.H[i] != first).any():
                 raise UsageError(
-                    "equivalent measurement: expected sensors that measure the same (one H), got another H of agent "
-                    f"{i + 1}"
+                    "estimators of measurements: expected sensors that measure the same (one H), got another H of "
+                    f"agent {i + 1}"
                 )
 
     def fuse(self, step: int, agent: int, values: Sequence[int], heard: int, due: Sequence[int]) -> int:
