@@ -1,4 +1,4 @@
-"""Methods side by side: the same quantity of one scenario, and what each differs from the reference by."""
+"""Methods side by side, and estimators side by side: the same scenario, several answers."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse.errors import UsageError
-from stochfuse.methods import METHODS, choose, predict
+from stochfuse.engines.enumeration import TooManyError
+from stochfuse.errors import NoAnswerError, UsageError
+from stochfuse.methods import ESTIMATORS, METHODS, choose, predict
 from stochfuse.metrics import Metric
 from stochfuse.prediction import Prediction
+from stochfuse.quantities import QUANTITIES
 from stochfuse.scenario import Scenario
 
 DEFAULT_METHODS = ("general", "simplified", "naive", "monte-carlo")
@@ -99,3 +101,90 @@ def _predict(scenario: Scenario, link: Any, method: str, settings: dict[str, Any
         return predict(scenario, link, method, **settings)
     except UsageError as error:
         raise UsageError(f"{method} cannot be compared here, leave it out of the methods: {error}") from None
+
+
+EASY = 2000
+"""Graphs up to which outcomes are enumerated without being asked to."""
+SIDE_BY_SIDE = ("claimed", "actual", "consistency")
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatorComparison:
+    """What several estimators claim and achieve in one scenario.
+
+    Parameters
+    ----------
+    predictions : one per estimator, each with the moments of its actual error.
+    left_out : estimators that were not asked for by name and cannot be had here, with the reason.
+    """
+
+    predictions: tuple[Prediction, ...]
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def estimators(self) -> tuple[str, ...]:
+        """Names of the estimators."""
+        return tuple(p.estimator for p in self.predictions)
+
+    def values(self, quantity: str, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray:
+        """Return a quantity's metric, shape (estimators, links, steps)."""
+        return np.stack([p.shown_as(quantity).values(of, agent) for p in self.predictions])
+
+
+def compare_estimators(
+    scenario: Scenario,
+    link: Sequence[float] | np.ndarray | float | None = None,
+    estimators: Sequence[str] | None = None,
+    method: str | None = None,
+    *,
+    quantities: Sequence[str] = SIDE_BY_SIDE,
+    **settings: Any,
+) -> EstimatorComparison:
+    """Predict what several estimators claim and what their errors truly are, on the same lossy network.
+
+    Parameters
+    ----------
+    scenario, link : as for `predict`.
+    estimators : names out of `stochfuse.methods.ESTIMATORS`; default: all that the scenario takes.
+    method : "general" or "monte-carlo"; default: exact where up to `EASY` graphs (or `max_graphs`) have to be carried,
+        else sampled, with the same arrivals for all estimators.
+    quantities : what is to be compared; bias and rms make a note of an initial error that is not known.
+    **settings : as for `predict`.
+
+    Raises
+    ------
+    UsageError
+        If an estimator is unknown, named twice, or cannot be had for the scenario; or if none can.
+    """
+    for name in estimators or ():
+        choose("estimator", name, ESTIMATORS)
+    if len(set(estimators or ())) < len(estimators or ()):
+        raise UsageError(f"estimator: expected different ones, got {', '.join(estimators or ())}")
+    if method is not None:
+        choose("methods", method, ("general", "monte-carlo"))
+    for quantity in quantities:
+        choose("quantity", quantity, tuple(q for q in QUANTITIES if q != "optimal"))
+    hardest = max(quantities, key=("claimed", "actual", "consistency", "bias", "rms").index)
+    found, left_out = [], []
+    for name in estimators or ESTIMATORS:
+        try:
+            found.append(_estimated(scenario, link, name, method, hardest, settings))
+        except (UsageError, NoAnswerError) as error:
+            if estimators:
+                raise type(error)(f"{name}: {error}") from None
+            left_out.append(f"{name}: {error}")
+    if not found:
+        raise UsageError("no estimator can be had here:\n  " + "\n  ".join(left_out))
+    return EstimatorComparison(tuple(found), tuple(left_out))
+
+
+def _estimated(
+    scenario: Scenario, link: Any, estimator: str, method: str | None, quantity: str, settings: dict[str, Any]
+) -> Prediction:
+    if method is not None:
+        return predict(scenario, link, method, quantity, estimator=estimator, **settings)
+    easy = {"max_graphs": EASY, **settings, "progress": None}
+    try:
+        return predict(scenario, link, "general", quantity, estimator=estimator, **easy)
+    except TooManyError:
+        return predict(scenario, link, "monte-carlo", quantity, estimator=estimator, **settings)

@@ -24,6 +24,7 @@ from stochfuse.engines import Progress
 from stochfuse.engines.enumeration import (
     Request,
     Structure,
+    TooManyError,
     claimed,
     enumerate_outcomes,
     expectation,
@@ -351,9 +352,9 @@ def groups_alike(
 
 
 def check_size(network: Network) -> None:
-    """Raise UsageError if there are too many agents to list what one of them may hear."""
+    """Raise TooManyError if there are too many agents to list what one of them may hear."""
     if number_of_senders(network.architecture, network.agents) > MOST_SENDERS or network.agents > MOST_AGENTS:
-        raise UsageError(
+        raise TooManyError(
             f"every outcome is gone through for at most {MOST_AGENTS} agents that hear at most {MOST_SENDERS} "
             f"others each, got {network.agents} agents, {network.architecture}: use --method optimal or "
             "--method monte-carlo"

@@ -1,9 +1,11 @@
-"""`stochfuse compare`: methods side by side, with the differences."""
+"""`stochfuse compare`: methods side by side with the differences, or estimators side by side."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -12,7 +14,8 @@ from stochfuse.cli.options import (
     AgentsOption,
     ArchitectureOption,
     DigitsOption,
-    EstimatorOption,
+    Estimator,
+    Format,
     FormatOption,
     LinkOption,
     MaxGraphsOption,
@@ -32,15 +35,25 @@ from stochfuse.cli.options import (
     load,
     quantity_names,
     settings_for,
+    whose,
     write_report,
 )
+
+if TYPE_CHECKING:
+    from stochfuse.metrics import Metric
+    from stochfuse.scenario import Scenario
 
 
 def compare(
     scenario: ScenarioArgument = "thesis-transient",
     methods: Annotated[
-        str, typer.Option(metavar="LIST", help="Methods to compare: simplified, general, optimal, naive, monte-carlo.")
-    ] = "general,simplified,naive,monte-carlo",
+        str | None,
+        typer.Option(
+            metavar="LIST",
+            help="Methods to compare: simplified, general, optimal, naive, monte-carlo; default: all but optimal. With "
+            "several estimators one, general or monte-carlo; default: general where that is easy.",
+        ),
+    ] = None,
     reference: Annotated[
         str | None, typer.Option(metavar="METHOD", help="What the others are compared with; default: the most exact.")
     ] = None,
@@ -51,12 +64,29 @@ def compare(
     r: ROption = None,
     p0: P0Option = None,
     architecture: ArchitectureOption = None,
-    estimator: EstimatorOption = None,
+    estimator: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LIST",
+            help="Compare these estimators instead, what each claims beside what is true: local-fusion-graph, naive, "
+            "optimal, covariance-intersection, split-ci, blender, joint-blender, equivalent-measurement, "
+            "independent-measurements, lwin, itns, stand-alone; all: those that the scenario takes. One, with "
+            "--methods: what the methods general and monte-carlo average.",
+        ),
+    ] = None,
     quantity: Annotated[
-        str, typer.Option(metavar="NAME", help="claimed, actual, consistency (actual / claimed), bias or rms.")
-    ] = "claimed",
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="claimed, actual, consistency (actual / claimed), bias or rms; default: claimed, of estimators "
+            "claimed,actual,consistency.",
+        ),
+    ] = None,
     metric: MetricOption = None,
-    agent: AgentOption = "mean",
+    agent: AgentOption = None,
+    all_steps: Annotated[
+        bool, typer.Option("--all-steps", help="With several estimators: a row for every step, not only the last.")
+    ] = False,
     relative: Annotated[bool, typer.Option("--relative", help="Differences in per cent of the reference.")] = False,
     max_graphs: MaxGraphsOption = None,
     prune: PruneOption = False,
@@ -68,50 +98,139 @@ def compare(
     output: OutputOption = None,
     plot: PlotOption = None,
 ) -> None:
-    """Show what methods predict side by side, and the signed differences.
+    """Show what methods predict side by side, and the signed differences; or what estimators claim and achieve.
 
     simplified is approximate, general and naive are exact averages over every outcome (naive of a rule that counts
     shared information twice), monte-carlo is sampled, with its standard error.
     """
-    from stochfuse.cli.progress import shown
-    from stochfuse.comparison import compare as run
     from stochfuse.errors import UsageError
     from stochfuse.metrics import metric as metric_of
-    from stochfuse.report import comparisons
-    from stochfuse.report.predictions import View
 
     check_files(output, plot, scenario)
-    chosen_methods = [name.strip() for name in methods.split(",")]
+    names = None if estimator is None else [name.strip() for name in estimator.split(",")]
+    several = names is not None and (len(names) > 1 or methods is None or names == ["all"])
+    ways = ["general", "simplified", "naive", "monte-carlo"] if methods is None else _names(methods)
+    if several and methods is not None and len(ways) > 1:
+        raise UsageError(f"--methods: expected one with several estimators, got {methods}")
     settings = settings_for(
-        chosen_methods,
-        estimator=estimator,
+        ["general", "monte-carlo"] if several and methods is None else ways,
+        estimator=None if several or names is None else Estimator(_known(names[0])),
         max_graphs=max_graphs,
         prune=prune,
         runs=runs,
         seed=seed,
         workers=workers,
     )
-    quantities = quantity_names(quantity)
-    if len(quantities) > 1:
-        raise UsageError(f"--quantity: expected one to compare methods by, got {quantity}; for several see predict")
+    for option, given_at_all in (("--reference", reference is not None), ("--relative", relative)):
+        if several and given_at_all:
+            raise UsageError(f"{option}: expected methods to compare, got several estimators")
+    if all_steps and not several:
+        raise UsageError("--all-steps: expected several estimators")
+    quantities = quantity_names(quantity or ("claimed,actual,consistency" if several else "claimed"))
     given, links = load(scenario, agents, steps, architecture, q, r, p0, link)
-    chosen = metric_of(metric or given.metric or "trace", given.model)
+    chosen, chosen_agent = metric_of(metric or given.metric or "trace", given.model), whose(agent, given)
+    shown = _Shown(chosen, chosen_agent, digits, format, output, plot)
+    if several:
+        only = None if names == ["all"] else names
+        _estimators(shown, given, links, only, None if methods is None else ways[0], quantities, all_steps, settings)
+    else:
+        if len(quantities) > 1:
+            raise UsageError(f"--quantity: expected one to compare methods by, got {quantity}; for several see predict")
+        _methods(shown, given, links, ways, reference, quantities[0], relative, settings)
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",")]
+
+
+def _known(estimator: str) -> str:
+    from stochfuse.methods import ESTIMATORS, choose
+
+    choose("estimator", estimator, ESTIMATORS)
+    return estimator
+
+
+class _Shown(NamedTuple):
+    """How an answer is shown."""
+
+    metric: Metric
+    agent: int | str
+    digits: int
+    format: Format | None
+    output: Path | None
+    plot: Path | None
+
+
+def _methods(
+    how: _Shown,
+    scenario: Scenario,
+    links: list[float] | None,
+    methods: Sequence[str],
+    reference: str | None,
+    quantity: str,
+    relative: bool,
+    settings: dict[str, Any],
+) -> None:
+    from stochfuse.cli.progress import shown
+    from stochfuse.comparison import compare as run
+    from stochfuse.report import comparisons
+    from stochfuse.report.predictions import View
+
     with shown() as progress:
-        found = run(given, links, chosen_methods, reference, quantities[0], progress=progress, **settings)
-    whose = int(agent) if agent.isdigit() else agent
+        found = run(scenario, links, methods, reference, quantity, progress=progress, **settings)
     view = comparisons.ComparisonView(
-        found, tuple(View(p, chosen, whose, None, digits) for p in found.predictions), relative
+        found, tuple(View(p, how.metric, how.agent, None, how.digits) for p in found.predictions), relative
     )
     view.values()
     for prediction in found.predictions:
         for note in prediction.notes:
             typer.echo(f"note: {prediction.method}: {note}", err=True)
-    if plot is not None:
-        comparisons.plot_comparison(view, plot)
+    if how.plot is not None:
+        comparisons.plot_comparison(view, how.plot)
     write_report(
-        format,
-        output,
+        how.format,
+        how.output,
         partial(comparisons.compare_table, view),
         partial(comparisons.compare_csv, view),
         partial(comparisons.compare_json, view),
+    )
+
+
+def _estimators(
+    how: _Shown,
+    scenario: Scenario,
+    links: list[float] | None,
+    names: Sequence[str] | None,
+    method: str | None,
+    quantities: Sequence[str],
+    all_steps: bool,
+    settings: dict[str, Any],
+) -> None:
+    from stochfuse.cli.progress import shown
+    from stochfuse.comparison import compare_estimators as run
+    from stochfuse.quantities import check
+    from stochfuse.report import estimators
+
+    for name in quantities:
+        check(name, how.metric)
+    with shown() as progress:
+        found = run(scenario, links, names, method, quantities=quantities, progress=progress, **settings)
+    view = estimators.EstimatorView(found, how.metric, how.agent, how.digits, quantities, all_steps)
+    for reason in found.left_out:
+        typer.echo(f"note: left out: {reason}", err=True)
+    for prediction in found.predictions:
+        for note in prediction.notes:
+            typer.echo(f"note: {prediction.estimator}: {note}", err=True)
+    for views in view.views:
+        warning = views[0].overconfidence()
+        if warning:
+            typer.echo(f"warning: {views[0].prediction.estimator}: {warning}", err=True)
+    if how.plot is not None:
+        estimators.plot_estimators(view, how.plot)
+    write_report(
+        how.format,
+        how.output,
+        partial(estimators.estimator_table, view),
+        partial(estimators.estimator_csv, view),
+        partial(estimators.estimator_json, view),
     )

@@ -94,8 +94,12 @@ MetricOption = Annotated[
     ),
 ]
 AgentOption = Annotated[
-    str,
-    typer.Option(metavar="N", help="Whose covariance where agents differ: mean, worst, best or an agent's number."),
+    str | None,
+    typer.Option(
+        metavar="N",
+        help="Whose covariance where agents differ: mean, worst, best or an agent's number; default: the scenario's, "
+        "else mean.",
+    ),
 ]
 EstimatorOption = Annotated[
     Estimator | None,
@@ -140,6 +144,13 @@ QuantityOption = Annotated[
 ]
 DigitsOption = Annotated[int, typer.Option(min=1, max=17, help="Significant digits in tables.")]
 PlotOption = Annotated[Path | None, typer.Option(metavar="FILE", help="Also draw a figure: .png, .svg or .pdf.")]
+
+
+def whose(agent: str | None, scenario: Scenario) -> int | str:
+    """Return the agent asked for: a number, or mean, worst or best."""
+    if agent is None:
+        return scenario.agent or "mean"
+    return int(agent) if agent.isdigit() else agent
 
 
 def load(

@@ -37,6 +37,7 @@ from stochfuse.cli.options import (
     load,
     quantity_names,
     settings_for,
+    whose,
     write_report,
 )
 
@@ -74,7 +75,7 @@ def predict(
             help="mean; or over the outcomes (general, naive): variance, std, quantile:P, at-most:LIMIT, derivative.",
         ),
     ] = "mean",
-    agent: AgentOption = "mean",
+    agent: AgentOption = None,
     normalise: Annotated[bool, typer.Option("--normalise", help="Relative to link probability 0.")] = False,
     steady: Annotated[
         bool, typer.Option("--steady", help="Add the steady state, P = g(P), with a proved bound (simplified).")
@@ -126,12 +127,12 @@ def predict(
             workers=workers,
         ),
     }
-    whose = int(agent) if agent.isdigit() else agent
+    chosen_agent = whose(agent, given)
     with _progress(method) as settings["progress"]:
         found = run(given, links, method.value, quantities, **settings)
         at_zero = run(given, [0.0], method.value, quantities, **settings) if normalise else [None] * len(found)
     views = tuple(
-        View(p, chosen, whose, baseline, digits, statistic) for p, baseline in zip(found, at_zero, strict=True)
+        View(p, chosen, chosen_agent, baseline, digits, statistic) for p, baseline in zip(found, at_zero, strict=True)
     )
     for view in views:
         view.values()  # a request that cannot be met should say so before notes and figures

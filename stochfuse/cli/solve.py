@@ -28,6 +28,7 @@ from stochfuse.cli.options import (
     check_files,
     load,
     settings_for,
+    whose,
     write_report,
 )
 from stochfuse.cli.predict import Method
@@ -79,7 +80,7 @@ def solve(
         str, typer.Option(metavar="NAME", help="claimed, actual, optimal, consistency, bias or rms.")
     ] = "claimed",
     metric: MetricOption = None,
-    agent: AgentOption = "mean",
+    agent: AgentOption = None,
     max_graphs: MaxGraphsOption = None,
     digits: DigitsOption = 5,
     format: FormatOption = None,
@@ -110,10 +111,10 @@ def solve(
         "method": method.value,
         "quantity": quantity,
         "of": metric,
-        "agent": int(agent) if agent.isdigit() else agent,
         **settings_for([method.value], estimator=estimator, max_graphs=max_graphs),
     }
     given, links = load(scenario, agents, steps, architecture, q, r, p0, link)
+    asked["agent"] = whose(agent, given)
     with _progress(method) as asked["progress"]:
         sheet, found = _answer(kind, given, links, target, case, max_agents, digits, asked)
     _note(sheet)

@@ -164,9 +164,11 @@ def _enumerate(estimator: Estimator, request: Request, progress: Progress) -> St
             expected = _expected(sizes, len(layer) * number[step - 1] // number[step - 2], len(estimator.relabellings))
             in_the_end = _extrapolated(sizes, expected, steps - step - two_steps)
             _check_exchange(before, len(fates(request.delay, left)), number[steps], request)
-            if expected > LONG or in_the_end > 10 * request.most:
+            # the first exchange says nothing yet of an estimator that forgets, or whose agents are soon alike
+            hopeless = len(sizes) > 1 and in_the_end > 10 * request.most
+            if expected > LONG or hopeless:
                 # an extrapolation may be off by a few times; what is far beyond the limit need not be begun
-                beyond = in_the_end if in_the_end > 10 * request.most else expected
+                beyond = in_the_end if hopeless else expected
                 _check_size(beyond, number[steps], request)
             if not announced and expected > LONG:
                 progress.expect(number[steps], in_the_end)
