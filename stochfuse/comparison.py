@@ -165,17 +165,19 @@ def compare_estimators(
     for quantity in quantities:
         choose("quantity", quantity, tuple(q for q in QUANTITIES if q != "optimal"))
     hardest = max(quantities, key=("claimed", "actual", "consistency", "bias", "rms").index)
-    found, left_out = [], []
+    found: list[Prediction] = []
+    left_out: dict[str, list[str]] = {}
     for name in estimators or ESTIMATORS:
         try:
             found.append(_estimated(scenario, link, name, method, hardest, settings))
         except (UsageError, NoAnswerError) as error:
+            reason = str(error).removeprefix(f"estimator {name}: ")
             if estimators:
-                raise type(error)(f"{name}: {error}") from None
-            left_out.append(f"{name}: {error}")
+                raise type(error)(f"estimator {name}: {reason}") from None
+            left_out.setdefault(reason, []).append(name)
     if not found:
         raise UsageError("no estimator can be had here:\n  " + "\n  ".join(left_out))
-    return EstimatorComparison(tuple(found), tuple(left_out))
+    return EstimatorComparison(tuple(found), tuple(f"{', '.join(n)}: {reason}" for reason, n in left_out.items()))
 
 
 def _estimated(

@@ -292,6 +292,7 @@ def outcomes(
     max_graphs: int = 100_000,
     prune: bool = False,
     plain: bool = False,
+    criterion: str = "det",
     progress: Progress | None = None,
 ) -> Outcomes:
     """Enumerate all outcomes of a scenario.
@@ -305,6 +306,7 @@ def outcomes(
     max_graphs : states that may be carried from step to step.
     prune : leave the least likely states out where there are more.
     plain : merge nothing.
+    criterion : what the weights of an intersection minimise, see `stochfuse.rules.make`.
     progress : told how far the work is.
 
     Raises
@@ -319,7 +321,9 @@ def outcomes(
     permutations = relabellings(network, rows, kinds)
     # a bursty link keeps its state where it is: nobody may change places
     fixed = plain or rows.bursts is not None
-    made = make(scenario, estimator, None if fixed else permutations, errors=errors, records=records)
+    made = make(
+        scenario, estimator, None if fixed else permutations, errors=errors, records=records, criterion=criterion
+    )
     per_step = [events(network, rows, step) for step in range(1, network.steps + 1)]
     if rows.bursts is not None:
         weights = bursty(per_step[0], len(rows.link))

@@ -30,6 +30,7 @@ ESTIMATORS = (
     "itns",
     "stand-alone",
 )
+CRITERIA = ("det", "trace", "max-eig")
 MOST_GRAPHS = 100_000
 RUNS, SEED = 1000, 1
 SELF_CONSISTENT = (
@@ -44,12 +45,13 @@ class Settings:
 
     Parameters
     ----------
-    estimator : what the agents do with what arrives (general and monte-carlo): "local-fusion-graph", "naive", or
-        "optimal", the best that linear fusion could do.
+    estimator : what the agents do with what arrives (general and monte-carlo), one of `ESTIMATORS`, see
+        `stochfuse.rules`.
     max_graphs : general, naive: different graphs that may be carried from step to step.
     prune : general, naive: leave the least likely graphs out where there are more, instead of giving up.
     runs, seed : monte-carlo: independent runs per link probability, and the seed.
     workers : monte-carlo: processes; default: one for small samples, else one per processor.
+    criterion : covariance-intersection, split-ci: what the weights minimise, "det", "trace" or "max-eig".
     progress : told how far long work is, see `stochfuse.engines.enumeration.Progress`.
     """
 
@@ -59,6 +61,7 @@ class Settings:
     runs: int = RUNS
     seed: int = SEED
     workers: int | None = None
+    criterion: str = "det"
     progress: Any = None
 
 
@@ -116,6 +119,7 @@ def predict(
         raise TypeError(f"predict() got an unexpected keyword argument '{sorted(unknown)[0]}'")
     how = Settings(**settings)
     choose("estimator", how.estimator, ESTIMATORS)
+    choose("criterion", how.criterion, CRITERIA)
     if steady and method != "simplified":
         raise UsageError(f"steady: expected method simplified, got {method}")
     if steady and quantity != "claimed":
@@ -206,6 +210,7 @@ def _enumerated(scenario: Scenario, rows: LinkRows, how: Settings, estimator: st
         errors=errors,
         max_graphs=how.max_graphs,
         prune=how.prune,
+        criterion=how.criterion,
         progress=how.progress,
     )
     left_out = float(found.left_out.max())
@@ -272,6 +277,7 @@ def _sampled(scenario: Scenario, rows: LinkRows, how: Settings, errors: bool) ->
         runs=how.runs,
         seed=how.seed,
         workers=how.workers,
+        criterion=how.criterion,
         progress=how.progress,
     )
     return {

@@ -57,6 +57,7 @@ def make(
     *,
     errors: bool = False,
     records: np.ndarray | None = None,
+    criterion: str = "det",
 ) -> Made:
     """Make an estimator for a scenario.
 
@@ -66,6 +67,7 @@ def make(
     relabellings : permutations of the agents that change nothing; None if nobody may change places.
     errors : whether noise footprints are carried along, see `stochfuse.sources`.
     records : measurements (steps, agents, p) where states are wanted, for estimators of sums of information.
+    criterion : what the weights of an intersection minimise: "det", "trace" or "max-eig".
 
     Raises
     ------
@@ -76,7 +78,8 @@ def make(
     if name in PASTS:
         if records is not None:
             raise UsageError(f"estimator {name}: its states cannot be had for a record of measurements")
-        return PASTS[name](world_of(scenario), scenario.kind_of, relabellings, errors=errors).make()
+        more = {"criterion": criterion} if issubclass(PASTS[name], SplitCovarianceIntersection) else {}
+        return PASTS[name](world_of(scenario), scenario.kind_of, relabellings, errors=errors, **more).make()
     everyone = tuple(range(scenario.network.agents))
     # records tell like agents apart; footprints only say whose noise is whose
     labels = everyone if errors or records is not None else scenario.sensor_of

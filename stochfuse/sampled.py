@@ -90,6 +90,7 @@ def sampled(
     runs: int = 1000,
     seed: int = 1,
     workers: int | None = None,
+    criterion: str = "det",
     progress: Progress | None = None,
 ) -> Sampled:
     """Draw a sample of an estimator's claimed covariances.
@@ -100,6 +101,7 @@ def sampled(
     runs : independent runs for every row, at least 2.
     seed : of the random numbers; the same seed gives the same sample, whatever the number of workers.
     workers : processes; default: one for small samples, else one per processor.
+    criterion : what the weights of an intersection minimise, see `stochfuse.rules.make`.
     progress : told how many parts of the work are done.
 
     Raises
@@ -125,7 +127,7 @@ def sampled(
         agents=network.agents,
         events=[events(network, rows, step) for step in range(1, network.steps + 1)],
         delay=network.delay,
-        make=partial(make, scenario, estimator, permutations, errors=errors),
+        make=partial(make, scenario, estimator, permutations, errors=errors, criterion=criterion),
         of=moments if errors else claimed_only,
         runs=runs,
         seed=seed,

@@ -28,8 +28,8 @@ from stochfuse.fusion.cooperative import Relation
 from stochfuse.metrics import metric as metric_of
 from stochfuse.model import Filter, Model, Noise, Sensor
 from stochfuse.network import LinkRows, Network, default_rows, restricted, stacked_rows, uniform_rows
-from stochfuse.noise_table import read_noise
-from stochfuse.scenario_tables import read_filters, read_link, read_model, read_network, read_sensors
+from stochfuse.tables.model import read_filters, read_link, read_model, read_network, read_sensors
+from stochfuse.tables.noise import read_noise
 
 SCHEMA = "stochfuse.scenario/1"
 DEFAULT = "thesis-transient"
@@ -98,7 +98,7 @@ class Scenario:
         ScenarioError
             Naming every offending key, what was expected there and what came.
         """
-        from stochfuse.schema import structure_problems
+        from stochfuse.tables.schema import structure_problems
 
         return _build(mapping, name, structure_problems(mapping))
 
@@ -354,7 +354,7 @@ def _navigation(
     check: Checker, mapping: Mapping[str, Any], network: Network | None
 ) -> tuple[Model | None, np.ndarray | None]:
     """Model and first covariance of an inertial navigation system."""
-    from stochfuse.navigation_table import read_navigation
+    from stochfuse.tables.navigation import read_navigation
 
     for key in ("model", "initial"):
         if key in mapping:
@@ -376,7 +376,7 @@ def _relations(
         return {}
     if model is None or network is None:
         return {}
-    from stochfuse.cooperative_table import read_cooperative
+    from stochfuse.tables.cooperative import read_cooperative
 
     if not own:
         check.note("model.own", "true, since agents measure each other's own places", "false")

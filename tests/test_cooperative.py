@@ -16,8 +16,6 @@ from scipy.spatial.transform import Rotation
 
 import stochfuse
 from stochfuse.checks import Checker
-from stochfuse.cooperative_schema import CooperativeTable
-from stochfuse.cooperative_table import read_cooperative
 from stochfuse.errors import UsageError
 from stochfuse.fusion.cooperative import (
     KINDS,
@@ -31,6 +29,8 @@ from stochfuse.fusion.cooperative import (
     residual,
 )
 from stochfuse.kalman import Estimate, update
+from stochfuse.tables.cooperative import read_cooperative
+from stochfuse.tables.cooperative_schema import CooperativeTable
 from tests.strategies import covariance, seeds
 
 SIGMAS = {"range": (0.5, None), "direction": (None, 0.02), "both": (0.5, 0.02), "difference": (0.5, 0.02)}

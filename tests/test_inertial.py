@@ -31,8 +31,8 @@ from stochfuse.fusion.inertial import (
 )
 from stochfuse.fusion.trajectory import Leg, Trajectory, trajectory
 from stochfuse.kalman import Estimate, predict, update
-from stochfuse.navigation_schema import NavigationTable
-from stochfuse.navigation_table import read_navigation
+from stochfuse.tables.navigation import read_navigation
+from stochfuse.tables.navigation_schema import NavigationTable
 from tests.strategies import seeds
 
 OMEGA, A, E2 = 7.292115e-5, 6378137.0, 6.69437999014e-3

@@ -9,9 +9,8 @@ import pytest
 
 import stochfuse as sf
 from stochfuse.general import outcomes
-from stochfuse.rules import PASTS
 from stochfuse.scenario import link_rows
-from tests import strategies, test_agreement, textbook, textbook_estimators
+from tests import strategies, test_agreement, textbook_estimators
 
 ONE_STATE = tuple(textbook_estimators.RULES)
 INTERSECTIONS = ("covariance-intersection", "split-ci")
@@ -100,8 +99,8 @@ CASES = {
         one_state(12, 2, 2, 3, 2, "broadcast", noise={"correlation": [[1, 0.6, 0], [0.6, 1, -0.3], [0, -0.3, 1]]},
                   agent=[{"R": covariance(2, 2)}, {"R": covariance(3, 2)}, {"R": covariance(4, 2)}]),
         ONE_STATE),
-    "correlated and disturbed, like agents": (
-        one_state(13, 1, 1, 3, 2, link=0.6, noise={"correlation": 0.4}), ONE_STATE),
+    "correlated, like agents": (
+        one_state(13, 1, 1, 3, 3, "cyclic", 0.6, noise={"correlation": 0.4}), ONE_STATE),
     "disturbed": (
         one_state(14, 2, 2, 2, 3, link=0.55, noise={"correlation": 0.7, "disturbance": covariance(5, 4)}), ONE_STATE),
     "delays": (one_state(15, 2, 1, 2, 3, link=0.6, network={"delay": [0.5, 0.3, 0.2]}), INTERSECTIONS),

@@ -11,7 +11,7 @@ import pytest
 
 import stochfuse as sf
 from stochfuse.scenario import parse, preset_names, read_text
-from stochfuse.schema import structure_problems
+from stochfuse.tables.schema import structure_problems
 
 GOOD = {
     "schema": "stochfuse.scenario/1",

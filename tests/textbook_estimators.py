@@ -168,9 +168,9 @@ class Truth:
 
     def rows(self, key, rows):
         out = np.zeros((rows.stop - rows.start, self.width + 1))
-        out[:, range(*self.column[key].indices(self.width))] = np.eye(
-            self.column[key].stop - self.column[key].start
-        )[rows]
+        out[:, range(*self.column[key].indices(self.width))] = np.eye(self.column[key].stop - self.column[key].start)[
+            rows
+        ]
         return out
 
     def first(self, i):
@@ -203,6 +203,9 @@ class Truth:
 # ---------------------------------------------------------------------------------------------- intersections
 
 
+_WEIGHTS = {}
+
+
 def intersect(signals):
     """Gains and C of split covariance intersection with the least determinant; signals (A1, A2, H)."""
 
@@ -216,17 +219,36 @@ def intersect(signals):
             out.append(-np.trace(C @ H.T @ inverse @ A1 @ inverse @ H))
         return np.array(out)
 
-    n = len(signals)
-    w = np.full(n, 1.0 / n)
-    if np.ptp(slope(w)) > 1e-11:
-        w = _minimised(lambda w: -np.linalg.slogdet(information(w))[1], slope, w)
+    key = tuple(np.round(part / np.abs(signals[0][0]).max(), 13).tobytes() for one in signals for part in one)
+    w = _WEIGHTS[key] if key in _WEIGHTS else _WEIGHTS.setdefault(key, _weights(signals, information, slope))
     C = np.linalg.inv(information(w))
     return [x * C @ H.T @ np.linalg.inv(A1 + x * A2) for x, (A1, A2, H) in zip(w, signals, strict=True)], C
 
 
+def _weights(signals, information, slope):
+    n = len(signals)
+    w = np.full(n, 1.0 / n)
+    if np.ptp(slope(w)) > 1e-11:
+        w = _minimised(lambda w: -np.linalg.slogdet(information(w))[1], slope, w)
+        # among equal signals any split of their weight is as good: equal ones are the estimator's choice
+        w = np.array(
+            [np.mean([x for x, other in zip(w, signals, strict=True) if _equal(one, other)]) for one in signals]
+        )
+    C = np.linalg.inv(information(w))
+    return [x * C @ H.T @ np.linalg.inv(A1 + x * A2) for x, (A1, A2, H) in zip(w, signals, strict=True)], C
+
+
+def _equal(one, other):
+    return all(
+        a.shape == b.shape and np.allclose(a, b, rtol=1e-10, atol=1e-12) for a, b in zip(one, other, strict=True)
+    )
+
+
 def _minimised(value, slope, start):
-    """SLSQP, then Newton's method on the weights above zero until their slopes are equal; signs of the others checked."""
+    """Brent's method between two; of more SLSQP, then Newton's method on the weights above zero until their slopes are equal; signs of the others checked."""
     n = len(start)
+    if n == 2:
+        return _between(lambda w: np.subtract(*slope(np.array([w, 1 - w]))))
     found = minimize(
         value, start, jac=slope, method="SLSQP", bounds=[(0, 1)] * n, options={"ftol": 1e-15, "maxiter": 500},
         constraints={"type": "eq", "fun": lambda w: w.sum() - 1, "jac": lambda w: np.ones(n)},
@@ -246,20 +268,27 @@ def _minimised(value, slope, start):
     return w
 
 
+def _between(rise):
+    if rise(0.0) >= 0 or rise(1.0) <= 0:
+        return np.array([0.0, 1.0]) if rise(0.0) >= 0 else np.array([1.0, 0.0])
+    w = brentq(rise, 0, 1, xtol=1e-15, rtol=1e-15)
+    return np.array([w, 1 - w])
+
+
 def _polished(slope, w, free):
     """Newton on the free weights with least-norm steps and differences for second derivatives."""
     index = np.flatnonzero(free)
     if len(index) == 1:
         return w
     N = np.linalg.svd(np.ones((1, len(index))))[2][1:].T  # directions that keep the sum
-    for _ in range(30):
+    for _ in range(8):
         g, h, columns = slope(w)[index], 1e-6, []
         for direction in N.T:
             move = np.zeros_like(w)
             move[index] = direction * min(h, 0.5 * w[index].min())
             columns.append(N.T @ (slope(w + move) - slope(w - move))[index] / (2 * min(h, 0.5 * w[index].min())))
         step = N @ np.linalg.pinv(np.array(columns).T, rcond=1e-7) @ (N.T @ g)
-        if np.abs(step).max() < 1e-15:
+        if np.abs(step).max() < 1e-13:
             break
         new = w.copy()
         new[index] -= step
@@ -483,43 +512,39 @@ RULES = {
 
 
 def of_histories(source, name):
-    """Each history's probability, and (claimed, actual, bias, mean square) of [step][agent] in it."""
+    """(claimed, actual, bias, mean square) of every agent after each history, and its probability, step by step."""
     t = Truth(source)
     rule = RULES[name](t)
-    known = {}
-
-    def after(history):
-        """Fused, what was there before the exchange at every step, and what is shown, from earlier steps' by prefix."""
-        key = tuple(map(frozenset, history))
-        if key not in known:
-            k = len(history)
-            if k == 1:
-                befores, now = [], rule.begin()
-            else:
-                fused, befores, _ = after(history[:-1])
-                now = rule.go_on(k, fused, befores[-1])
-            befores = [*befores, now]
-            heard = [sorted(j for j, r, sent in history[-1] if r == i and sent == k) for i in range(t.n)]
-            late = [[brought(i, j, sent, k, befores) for j, r, sent in sorted(history[-1]) if r == i and sent < k]
-                    for i in range(t.n)]  # fmt: skip
-            fused = rule.exchange(k, now, heard, late)
-            known[key] = fused, befores, [t.moments(*each) for each in rule.shown(k, fused)]
-        return known[key]
-
-    def brought(i, j, sent, k, befores):
-        one = befores[sent - 1][j]
-        for step in range(sent + 1, k + 1):
-            one = t.forward(i, step, one)
-        return one
-
+    likely = {}
     for probability, history in textbook.histories(t.n, t.steps, t.architecture, t.link, t.delay):
-        yield probability, [after(history[: k + 1])[2] for k in range(t.steps)]
+        for k in range(1, t.steps + 1):
+            key = tuple(map(frozenset, history[:k]))
+            likely[key] = likely.get(key, 0.0) + probability
+    reached = {(): (None, [])}
+    for key, probability in sorted(likely.items(), key=lambda item: len(item[0])):
+        k, (fused, befores) = len(key), reached[key[:-1]]
+        now = rule.begin() if k == 1 else rule.go_on(k, fused, befores[-1])
+        befores = [*befores, now]
+        heard = [sorted(j for j, r, sent in key[-1] if r == i and sent == k) for i in range(t.n)]
+        late = [[_brought(t, i, befores[sent - 1][j], sent, k) for j, r, sent in sorted(key[-1]) if r == i and sent < k]
+                for i in range(t.n)]  # fmt: skip
+        fused = rule.exchange(k, now, heard, late)
+        reached[key] = fused, befores
+        yield k, probability, [t.moments(*each) for each in rule.shown(k, fused)]
+
+
+def _brought(t, i, one, sent, k):
+    for step in range(sent + 1, k + 1):
+        one = t.forward(i, step, one)
+    return one
 
 
 def expected(source, name):
     """Expected claimed and actual covariance, bias and mean squared error, each [step][agent]."""
-    total = None
-    for probability, steps in of_histories(source, name):
-        found = [np.array([[moments[q] for moments in step] for step in steps]) * probability for q in range(4)]
-        total = found if total is None else [a + b for a, b in zip(total, found, strict=True)]
-    return dict(zip(("claimed", "actual", "bias", "rms"), total, strict=True))
+    total = {}
+    for k, probability, agents in of_histories(source, name):
+        for q, quantity in enumerate(("claimed", "actual", "bias", "rms")):
+            found = probability * np.array([moments[q] for moments in agents])
+            total.setdefault(quantity, {})
+            total[quantity][k] = total[quantity].get(k, 0.0) + found
+    return {quantity: np.array([by[k] for k in sorted(by)]) for quantity, by in total.items()}

@@ -13,6 +13,7 @@ from stochfuse.cli.options import (
     AgentOption,
     AgentsOption,
     ArchitectureOption,
+    CriterionOption,
     DigitsOption,
     Estimator,
     Format,
@@ -93,6 +94,7 @@ def compare(
     runs: RunsOption = None,
     seed: SeedOption = None,
     workers: WorkersOption = None,
+    criterion: CriterionOption = None,
     digits: DigitsOption = 5,
     format: FormatOption = None,
     output: OutputOption = None,
@@ -120,6 +122,7 @@ def compare(
         runs=runs,
         seed=seed,
         workers=workers,
+        criterion=criterion,
     )
     for option, given_at_all in (("--reference", reference is not None), ("--relative", relative)):
         if several and given_at_all:

@@ -43,6 +43,14 @@ class Estimator(StrEnum):
     stand_alone = "stand-alone"
 
 
+class Criterion(StrEnum):
+    """What the weights of an intersection minimise."""
+
+    det = "det"
+    trace = "trace"
+    max_eig = "max-eig"
+
+
 class Architecture(StrEnum):
     """Network architectures."""
 
@@ -143,6 +151,13 @@ QuantityOption = Annotated[
     ),
 ]
 DigitsOption = Annotated[int, typer.Option(min=1, max=17, help="Significant digits in tables.")]
+CriterionOption = Annotated[
+    Criterion | None,
+    typer.Option(
+        help="covariance-intersection, split-ci: what the weights minimise; default: det, whatever the units.",
+        show_default=False,
+    ),
+]
 PlotOption = Annotated[Path | None, typer.Option(metavar="FILE", help="Also draw a figure: .png, .svg or .pdf.")]
 
 
@@ -187,6 +202,7 @@ APPLIES_TO = {
     "runs": ("monte-carlo",),
     "seed": ("monte-carlo",),
     "workers": ("monte-carlo",),
+    "criterion": ("general", "monte-carlo"),
 }
 """Methods that each setting means something to."""
 

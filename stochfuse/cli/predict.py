@@ -14,6 +14,7 @@ from stochfuse.cli.options import (
     AgentOption,
     AgentsOption,
     ArchitectureOption,
+    CriterionOption,
     DigitsOption,
     EstimatorOption,
     Format,
@@ -85,6 +86,7 @@ def predict(
     runs: RunsOption = None,
     seed: SeedOption = None,
     workers: WorkersOption = None,
+    criterion: CriterionOption = None,
     digits: DigitsOption = 5,
     format: FormatOption = None,
     output: OutputOption = None,
@@ -125,6 +127,7 @@ def predict(
             runs=runs,
             seed=seed,
             workers=workers,
+            criterion=criterion,
         ),
     }
     chosen_agent = whose(agent, given)

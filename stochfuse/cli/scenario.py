@@ -79,7 +79,7 @@ def check(scenario: ScenarioArgument) -> None:
 def schema(output: OutputOption = None) -> None:
     """Print the JSON Schema of a scenario file."""
     from stochfuse.report.export import to_json, write_text
-    from stochfuse.schema import ScenarioFile
+    from stochfuse.tables.schema import ScenarioFile
 
     write_text(to_json(ScenarioFile.model_json_schema(by_alias=True)), output)
 

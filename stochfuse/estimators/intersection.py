@@ -9,7 +9,7 @@ Agents that track one state fuse the estimates heard.  Agents with states of the
 they measured of each neighbour, z − H_j x̂_j, a signal about H_i x_i whose correlated part is H_j A_j1 H_jᵀ and whose
 independent part is H_j A_j2 H_jᵀ + R.
 
-Weights minimise the determinant.  A message that comes late is brought forward, and nothing of it is independent.
+Weights minimise the determinant, or another criterion.  A message that comes late is brought forward, and nothing of it is independent.
 """
 
 from __future__ import annotations
@@ -20,19 +20,32 @@ from typing import Any
 import numpy as np
 
 from stochfuse.estimators.recursion import RecursiveEstimator, Rule, Worked
-from stochfuse.fusion.covariance_intersection import fuse_stack
+from stochfuse.fusion.covariance_intersection import Criterion, fuse_stack
 from stochfuse.model import at_step
+from stochfuse.world import World
 
 TOGETHER, RELATED = "intersection", "related intersection"
 
 
 class SplitCovarianceIntersection(RecursiveEstimator):
-    """The estimator; parameters are those of `RecursiveEstimator`."""
+    """The estimator; parameters are those of `RecursiveEstimator`, and the criterion that the weights minimise."""
 
     symmetric = (TOGETHER,)
     takes_late = True
     split = True
     """Whether anything is taken for independent."""
+
+    def __init__(
+        self,
+        world: World,
+        kinds: Sequence[int],
+        relabellings: Sequence[tuple[int, ...]] | None = None,
+        *,
+        errors: bool = False,
+        criterion: str = "det",
+    ) -> None:
+        super().__init__(world, kinds, relabellings, errors=errors)
+        self.criterion = Criterion(criterion)
 
     def fuse(self, step: int, agent: int, values: Sequence[int], heard: int, due: Sequence[int]) -> int:
         """Value of the intersection of everything heard."""
@@ -48,7 +61,7 @@ class SplitCovarianceIntersection(RecursiveEstimator):
         split = [self._split(each) for each in rests_on]
         known, independent = [c for c, _ in split], [i for _, i in split]
         if rules[0][0] == TOGETHER:
-            stack = fuse_stack(known, independent)
+            stack = fuse_stack(known, independent, criterion=self.criterion)
             x = None if rests_on[0].x is None else _sum(stack.gains, [each.x for each in rests_on])
             return Worked(stack.C, x)
         return self._related(step, rules[0][1:], rests_on, known, independent)
@@ -77,12 +90,12 @@ class SplitCovarianceIntersection(RecursiveEstimator):
             independent[place] = H_j @ independent[place] @ H_j.T + (R if self.split else 0.0 * R)
             if self.footprints is not None:
                 signals.append(self.footprints.related(step, (agent, j)) - H_j @ rests_on[place].x)
-        stack = fuse_stack(known, independent, maps)
+        stack = fuse_stack(known, independent, maps, self.criterion)
         return Worked(stack.C, None if self.footprints is None else _sum(stack.gains, signals))
 
 
 class CovarianceIntersection(SplitCovarianceIntersection):
-    """The estimator; parameters are those of `RecursiveEstimator`."""
+    """The estimator; parameters are those of `SplitCovarianceIntersection`."""
 
     split = False
 

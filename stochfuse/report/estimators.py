@@ -16,12 +16,12 @@ from stochfuse.comparison import EstimatorComparison
 from stochfuse.metrics import Metric
 from stochfuse.report import predictions
 from stochfuse.report.export import write_file
-from stochfuse.report.plot import MARKERS, figure_class
+from stochfuse.report.plot import COLORS, MARKERS, figure_class
 from stochfuse.report.predictions import View
 from stochfuse.report.table import Table, number
 
 SCHEMA = "stochfuse.estimators/1"
-RATIO = "actual/claimed"
+RATIO = "actual / claimed"
 STYLES: dict[str, Any] = {"claimed": "--", "actual": "-", "consistency": "-", "bias": ":", "rms": "-."}
 
 
@@ -71,9 +71,16 @@ class EstimatorView:
         return (
             *(view.what for view in first),
             step + first[0].whom,
-            "; ".join(f"{p.estimator} {p.nature}" for p in self.comparison.predictions),
+            "; ".join(f"{nature}: {', '.join(names)}" for nature, names in self._natures.items()),
             *sorted(sampled),
         )
+
+    @property
+    def _natures(self) -> dict[str, list[str]]:
+        found: dict[str, list[str]] = {}
+        for p in self.comparison.predictions:
+            found.setdefault(p.nature, []).append(p.estimator)
+        return found
 
     @property
     def _sampled(self) -> list[Any]:
@@ -97,7 +104,7 @@ def estimator_table(view: EstimatorView) -> Table:
                 step = (str(p.steps[k]),) if view.every_step else ()
                 rows.append((*name, f"{µ:.6g}", *step, estimator, *cells))
     keys = ("µ",) if p.cases is None else ("links", "mean µ")
-    columns = tuple(RATIO if q == "consistency" else q for q in view.quantities)
+    columns = tuple("ratio" if q == "consistency" else q for q in view.quantities)
     return Table(view.titles, (*keys, *(("k",) if view.every_step else ()), "estimator"), columns, tuple(rows))
 
 
@@ -157,7 +164,6 @@ def plot_estimators(view: EstimatorView, output: Path) -> None:
 def draw(view: EstimatorView):
     """Return the figure: a panel for quantities with the metric's unit, one for the ratio."""
     Figure = figure_class()
-    from matplotlib import colormaps
     from matplotlib.lines import Line2D
     from matplotlib.ticker import MaxNLocator
 
@@ -169,7 +175,7 @@ def draw(view: EstimatorView):
     panels = list(dict.fromkeys(axis_of))
     figure = Figure(figsize=(2.0 + 4.6 * len(panels), 5.4), layout="constrained")
     axes_of = dict(zip(panels, figure.subplots(1, len(panels), squeeze=False)[0], strict=True))
-    colors = colormaps["tab10"](np.arange(len(view.values)) % 10)
+    colors = [COLORS[e % len(COLORS)] for e in range(len(view.values))]
     for e, (values, color) in enumerate(zip(view.values, colors, strict=True)):
         for c, quantity in enumerate(view.quantities):
             axes = axes_of[axis_of[c]]

@@ -14,6 +14,8 @@ from stochfuse.report.predictions import View
 
 MOST_CURVES = 8
 MARKERS = "osD^vP*X"
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000", "#8A6D00")
+"""Colours that the colour-blind can tell apart (Okabe and Ito), the yellow one darkened for print."""
 
 
 def plot_prediction(view: View, output: Path) -> None:

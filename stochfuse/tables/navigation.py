@@ -5,7 +5,7 @@
     [navigation.imu]        random walks, biases, instabilities, correlation times in the units of data sheets
     [navigation.initial]    attitude, velocity, position: standard deviations along north, east, down
 
-Keys and units are those of `stochfuse.navigation_schema`; the mathematics is `stochfuse.fusion.inertial`.
+Keys and units are those of `stochfuse.tables.navigation_schema`; the mathematics is `stochfuse.fusion.inertial`.
 """
 
 from __future__ import annotations

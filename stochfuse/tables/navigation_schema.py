@@ -1,22 +1,20 @@
 """The structure of a scenario file's [navigation] table, for pydantic.
 
-Whether the numbers fit together is checked in `stochfuse.navigation_table`.
+Whether the numbers fit together is checked in `stochfuse.tables.navigation`.
 """
 
 from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, Strict
+from pydantic import Field, Strict
+
+from stochfuse.tables.base import Table
 
 Real = Annotated[float, Strict()]
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=True)
-
-
-class LegTable(_Table):
+class LegTable(Table):
     """A part of the nominal way, with constant manoeuvre."""
 
     duration: Real = Field(description="s")
@@ -25,7 +23,7 @@ class LegTable(_Table):
     climb: Real = Field(0.0, description="rate of climb at the end of the leg, reached evenly, m/s")
 
 
-class ImuTable(_Table):
+class ImuTable(Table):
     """The inertial measurement unit, in the units of data sheets; alike on its three axes."""
 
     angle_random_walk: Real = Field(description="white noise of the gyros, °/√h")
@@ -38,7 +36,7 @@ class ImuTable(_Table):
     accelerometer_time: Real = Field(description="correlation time of the accelerometers' bias, s")
 
 
-class InitialErrorsTable(_Table):
+class InitialErrorsTable(Table):
     """Standard deviations of the first estimate, along north, east and down; the biases' are the IMU's."""
 
     attitude: list[Real] = Field(description="about north, about east, of the heading, °")
@@ -46,7 +44,7 @@ class InitialErrorsTable(_Table):
     position: list[Real] = Field(description="m")
 
 
-class NavigationTable(_Table):
+class NavigationTable(Table):
     """An inertial navigation system's 15 errors along a nominal way: takes the place of F, Q and the first P."""
 
     latitude: Real = Field(description="at the start, °")

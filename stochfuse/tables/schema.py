@@ -6,26 +6,22 @@ scenario, wherever it comes from.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 
 from stochfuse.checks import shown
-from stochfuse.cooperative_schema import CooperativeTable
 from stochfuse.errors import Problem
-from stochfuse.navigation_schema import NavigationTable
+from stochfuse.tables.base import Number, Table
+from stochfuse.tables.cooperative_schema import CooperativeTable
+from stochfuse.tables.navigation_schema import NavigationTable
 
-Number = Annotated[int, Strict()] | Annotated[float, Strict()]
 Vector = Number | list[Number] | list[list[Number]]
 Matrix = Number | list[list[Number]] | list[list[list[Number]]]
 Link = Number | list[Number | list[Number] | list[list[Number]]]
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=True)
-
-
-class ModelTable(_Table):
+class ModelTable(Table):
     """Linear-Gaussian model x(k) = F x(k−1) + B u + G v, z(k) = H x(k) + w, with v ~ N(0, Q), w ~ N(0, R)."""
 
     F: Matrix = Field(description="state transition, d×d; its size is the number of states")
@@ -40,7 +36,7 @@ class ModelTable(_Table):
     units: list[str] | None = Field(None, description="units of the states")
 
 
-class InitialTable(_Table):
+class InitialTable(Table):
     """The estimates that the agents start with, at step 1."""
 
     P: Matrix = Field(description="covariance of each agent's first estimate, d×d")
@@ -51,7 +47,7 @@ class InitialTable(_Table):
     error: Vector | None = Field(None, description="known initial error (bias), common to all agents")
 
 
-class BurstTable(_Table):
+class BurstTable(Table):
     """A bursty link (Gilbert and Elliott): good or bad, with a memory; each link on its own."""
 
     good_to_bad: Number = Field(description="probability that a good link is bad in the next step")
@@ -60,7 +56,7 @@ class BurstTable(_Table):
     bad: Number = Field(0.0, description="delivery probability of a bad link")
 
 
-class CaseTable(_Table):
+class CaseTable(Table):
     """A named alternative to network.link."""
 
     name: str
@@ -68,7 +64,7 @@ class CaseTable(_Table):
     burst: BurstTable | None = Field(None, description="as network.burst, instead of a link")
 
 
-class NetworkTable(_Table):
+class NetworkTable(Table):
     """Who may hear whom, and how likely."""
 
     agents: int = Field(ge=1, strict=True, description="number of agents")
@@ -89,7 +85,7 @@ class NetworkTable(_Table):
     case: list[CaseTable] | None = Field(None, description="named alternatives to link, one row of the table each")
 
 
-class AgentTable(_Table):
+class AgentTable(Table):
     """One agent's own sensor, filter and place, where they differ from the model's."""
 
     H: Matrix | None = None
@@ -103,7 +99,7 @@ class AgentTable(_Table):
     position: Vector | None = Field(None, description="nominal place for cooperative measurements, or one per step")
 
 
-class NoiseTable(_Table):
+class NoiseTable(Table):
     """How noises hang together that are otherwise independent."""
 
     correlation: Number | list[list[Number]] | None = Field(
@@ -119,14 +115,14 @@ class NoiseTable(_Table):
     )
 
 
-class ReportTable(_Table):
+class ReportTable(Table):
     """How results are shown where the command does not say."""
 
     metric: str | None = Field(None, description="default metric, as --metric takes it")
     agent: int | None = Field(None, ge=1, strict=True, description="whose estimate is shown; default: the mean")
 
 
-class ScenarioFile(_Table):
+class ScenarioFile(Table):
     """A stochfuse scenario."""
 
     model_config = ConfigDict(

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, Strict
+from pydantic import Field, Strict
 
-Number = Annotated[int, Strict()] | Annotated[float, Strict()]
+from stochfuse.tables.base import Number, Table
+
 Whole = Annotated[int, Strict()]
 Flag = Annotated[bool, Strict()]
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=True)
-
-
-class PairTable(_Table):
+class PairTable(Table):
     """What one pair of agents measures, in place of what all pairs measure."""
 
     agents: list[Whole] = Field(description="the observer and the other, counted from 1")
@@ -27,7 +24,7 @@ class PairTable(_Table):
     both_ways: Flag = Field(True, description="whether the other measures the observer likewise, with noise of its own")
 
 
-class CooperativeTable(_Table):
+class CooperativeTable(Table):
     """Agents that measure each other: relative range, line-of-sight direction, or both."""
 
     positions: list[str] = Field(description="names of the 2 or 3 states that are the place")
