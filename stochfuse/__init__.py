@@ -19,6 +19,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from stochfuse.comparison import Comparison as Comparison
     from stochfuse.comparison import compare as compare
+    from stochfuse.comparison import compare_estimators as compare_estimators
     from stochfuse.crosscheck import check_results as check_results
     from stochfuse.errors import NoAnswerError as NoAnswerError
     from stochfuse.errors import ScenarioError as ScenarioError
@@ -62,6 +63,7 @@ _HOME = {
     "agents_needed": "inverse.agents_needed",
     "check_results": "crosscheck",
     "compare": "comparison",
+    "compare_estimators": "comparison",
     "derive_general": "symbolic_general",
     "derive_optimal": "symbolic_optimal",
     "derive_simplified": "symbolic",
@@ -94,6 +96,7 @@ __all__ = [
     "agents_needed",
     "check_results",
     "compare",
+    "compare_estimators",
     "derive_general",
     "derive_optimal",
     "derive_simplified",

@@ -35,6 +35,28 @@ def size(shape: Sequence[int]) -> str:
     return "×".join(map(str, shape))
 
 
+def covariance_fault(array: np.ndarray, *, definite: bool = False) -> str | None:
+    """Return why stacks of square matrices (..., n, n) are no covariances, or None if they are, up to rounding.
+
+    Parameters
+    ----------
+    definite : whether singular ones are none either.
+    """
+    if not np.isfinite(array).all():
+        return "a value that is not finite (NaN or infinity)"
+    diagonal = np.diagonal(array, axis1=-2, axis2=-1)
+    if (diagonal < 0).any() or (definite and (diagonal <= 0).any()):
+        return f"a variance of {diagonal.min():g} on the diagonal"
+    scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    scaled = array / (scale[..., :, None] * scale[..., None, :])
+    if np.abs(scaled - np.swapaxes(scaled, -1, -2)).max(initial=0.0) > SYMMETRY:
+        return "an asymmetric one"
+    smallest = float(np.linalg.eigvalsh(0.5 * (scaled + np.swapaxes(scaled, -1, -2))).min(initial=np.inf))
+    if smallest < INDEFINITE:
+        return f"an indefinite one (smallest eigenvalue, scaled to unit variances, {smallest:.3g})"
+    return "a singular one" if definite and smallest <= 1e-15 else None
+
+
 class Checker:
     """Reads values by their path and remembers what was wrong.
 
@@ -107,23 +129,11 @@ class Checker:
         if array is None:
             return None
         kind = f"a symmetric positive {'definite' if definite else 'semi-definite'} matrix"
-        diagonal = np.diagonal(array, axis1=-2, axis2=-1)
-        if (diagonal < 0).any() or (definite and (diagonal <= 0).any()):
-            self.note(path, kind, f"a variance of {diagonal.min():g} on the diagonal")
-            return None
-        scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-        scaled = array / (scale[..., :, None] * scale[..., None, :])
-        if np.abs(scaled - np.swapaxes(scaled, -1, -2)).max() > SYMMETRY:
-            self.note(path, kind, "an asymmetric one")
+        fault = covariance_fault(array, definite=definite)
+        if fault is not None:
+            self.note(path, kind, fault)
             return None
         array = 0.5 * (array + np.swapaxes(array, -1, -2))
-        smallest = float(np.linalg.eigvalsh(0.5 * (scaled + np.swapaxes(scaled, -1, -2))).min())
-        if smallest < INDEFINITE:
-            self.note(path, kind, f"an indefinite one (smallest eigenvalue, scaled to unit variances, {smallest:.3g})")
-            return None
-        if definite and smallest <= 1e-15:
-            self.note(path, kind, "a singular one")
-            return None
         array.setflags(write=False)
         return array
 

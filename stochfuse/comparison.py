@@ -169,7 +169,7 @@ def compare_estimators(
     left_out: dict[str, list[str]] = {}
     for name in estimators or ESTIMATORS:
         try:
-            found.append(_estimated(scenario, link, name, method, hardest, settings))
+            found.append(_estimated(scenario, link, name, method, hardest, settings).shown_as(quantities[0]))
         except (UsageError, NoAnswerError) as error:
             reason = str(error).removeprefix(f"estimator {name}: ")
             if estimators:

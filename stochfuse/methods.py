@@ -10,29 +10,15 @@ import numpy as np
 
 from stochfuse import simplified
 from stochfuse.errors import UsageError
+from stochfuse.names import CRITERIA, ESTIMATORS, METHODS
 from stochfuse.network import LinkRows
 from stochfuse.prediction import Prediction
 from stochfuse.quantities import QUANTITIES, Moments
 from stochfuse.scenario import Scenario, link_rows
 
-METHODS = ("simplified", "general", "optimal", "naive", "monte-carlo")
-ESTIMATORS = (
-    "local-fusion-graph",
-    "naive",
-    "optimal",
-    "covariance-intersection",
-    "split-ci",
-    "blender",
-    "joint-blender",
-    "equivalent-measurement",
-    "independent-measurements",
-    "lwin",
-    "itns",
-    "stand-alone",
-)
-CRITERIA = ("det", "trace", "max-eig")
 MOST_GRAPHS = 100_000
 RUNS, SEED = 1000, 1
+LFG = "local-fusion-graph"
 SELF_CONSISTENT = (
     "the simplified formulation takes for granted that agents share the broadcast prior and nothing else: by its own "
     "assumptions the actual covariance is the claimed one; for what is true see method general"
@@ -72,7 +58,7 @@ NO_ERROR = "the scenario has no known initial error (initial.error): the bias is
 def predict(
     scenario: Scenario,
     link: Sequence[float] | np.ndarray | float | LinkRows | None = None,
-    method: str = "simplified",
+    method: str | None = None,
     quantity: str = "claimed",
     *,
     steady: bool = False,
@@ -85,7 +71,7 @@ def predict(
     scenario : from `load_scenario`.
     link : link probabilities, one row of the result each; an array of shape (rows, agents, agents) gives a matrix µ_ij
         (receiver, sender) per row.  Default: the scenario's cases, else its link, else 0, 0.25, 0.5, 0.75 and 1.
-    method : one of
+    method : default: what the scenario asks for (report.method), else simplified; one of
         "simplified", thesis (50)–(54), approximate (mean field);
         "general", thesis (44)–(49), exact: every outcome, its common information found by the Local Fusion Graph;
         "naive", the same with naive fusion (42)/(43);
@@ -112,12 +98,13 @@ def predict(
     NoAnswerError
         If a steady state is asked for and there is none.
     """
+    method = method or scenario.method or "simplified"
     choose("method", method, METHODS)
     choose("quantity", quantity, QUANTITIES)
     unknown = set(settings) - set(Settings.__dataclass_fields__)
     if unknown:
         raise TypeError(f"predict() got an unexpected keyword argument '{sorted(unknown)[0]}'")
-    how = Settings(**settings)
+    how = Settings(**{"estimator": scenario.estimator or LFG, "runs": scenario.runs or RUNS, **settings})
     choose("estimator", how.estimator, ESTIMATORS)
     choose("criterion", how.criterion, CRITERIA)
     if steady and method != "simplified":
@@ -159,11 +146,12 @@ def predict(
 def predict_several(
     scenario: Scenario,
     link: Sequence[float] | np.ndarray | float | LinkRows | None,
-    method: str,
+    method: str | None,
     quantities: Sequence[str],
     **settings: Any,
 ) -> list[Prediction]:
     """Predict several quantities, with no more work than the hardest of them needs; see `predict`."""
+    method = method or scenario.method or "simplified"
     apart = [q for q in quantities if q == "optimal" and method != "optimal"]
     together = [q for q in quantities if q not in apart]
     if method == "optimal" and {"claimed", "optimal"} <= set(together):

@@ -8,7 +8,7 @@ from stochfuse.engines.enclosure import enclosed_optimum
 from stochfuse.events import relabellings
 from stochfuse.general import groups_alike
 from stochfuse.network import LinkRows
-from stochfuse.scenario import Scenario
+from stochfuse.scenario import Scenario, require_independent_noise, require_one_state
 
 
 def optimum(scenario: Scenario, rows: LinkRows) -> tuple[Chain, tuple[tuple[int, ...], ...]]:
@@ -21,6 +21,8 @@ def optimum(scenario: Scenario, rows: LinkRows) -> tuple[Chain, tuple[tuple[int,
     UsageError
         If the chain's states or paths are too many.
     """
+    require_one_state(scenario, "the optimum")
+    require_independent_noise(scenario, "the optimum")
     network, kinds = scenario.network, scenario.sensor_of
     alike = len(set(kinds)) == 1 and rows.uniform
     groups = (

@@ -9,21 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 
 from stochfuse.errors import UsageError
 from stochfuse.estimators import Made
-from stochfuse.estimators.alone import StandAlone
-from stochfuse.estimators.blender import Blender, JointBlender
-from stochfuse.estimators.cooperative import Itns, Lwin
-from stochfuse.estimators.equivalent import EquivalentMeasurement, IndependentMeasurements
-from stochfuse.estimators.intersection import CovarianceIntersection, SplitCovarianceIntersection
 from stochfuse.estimators.local_fusion_graph import LocalFusionGraph
 from stochfuse.estimators.naive import NaiveFusion
 from stochfuse.estimators.optimal import OptimalFusion
-from stochfuse.estimators.recursion import RecursiveEstimator
 from stochfuse.information import InformationClaims, Ledger, Sources, evaluate
 from stochfuse.scenario import Scenario, require_independent_noise
 from stochfuse.sources import error_sources, sources_of, world_of
@@ -34,20 +29,24 @@ SUMS: dict[str, Any] = {
     "optimal": OptimalFusion,
 }
 """Estimators whose estimates are sums of information."""
-PASTS: dict[str, type[RecursiveEstimator]] = {
-    "covariance-intersection": CovarianceIntersection,
-    "split-ci": SplitCovarianceIntersection,
-    "blender": Blender,
-    "joint-blender": JointBlender,
-    "equivalent-measurement": EquivalentMeasurement,
-    "independent-measurements": IndependentMeasurements,
-    "lwin": Lwin,
-    "itns": Itns,
-    "stand-alone": StandAlone,
+PASTS = {
+    "covariance-intersection": ("intersection", "CovarianceIntersection"),
+    "split-ci": ("intersection", "SplitCovarianceIntersection"),
+    "blender": ("blender", "Blender"),
+    "joint-blender": ("blender", "JointBlender"),
+    "equivalent-measurement": ("equivalent", "EquivalentMeasurement"),
+    "independent-measurements": ("equivalent", "IndependentMeasurements"),
+    "lwin": ("cooperative", "Lwin"),
+    "itns": ("cooperative", "Itns"),
+    "stand-alone": ("alone", "StandAlone"),
 }
-"""Estimators that remember pasts."""
+"""Estimators that remember pasts: module in `stochfuse.estimators`, and class; imported when asked for."""
+INTERSECTIONS = ("covariance-intersection", "split-ci")
 WITH_OWN_STATES = ("covariance-intersection", "split-ci", "lwin", "itns", "stand-alone")
 WITH_OWN_FILTERS = ("blender", "joint-blender")
+WITHOUT_FOOTPRINTS = ("equivalent-measurement", "independent-measurements", "itns")
+MOST_COEFFICIENTS = 20_000
+"""Coefficients on noises that an estimate may carry along."""
 
 
 def make(
@@ -75,11 +74,15 @@ def make(
         If the estimator is not one for such a scenario.
     """
     check(scenario, name)
+    if errors:
+        _check_footprints(scenario, name)
     if name in PASTS:
         if records is not None:
             raise UsageError(f"estimator {name}: its states cannot be had for a record of measurements")
-        more = {"criterion": criterion} if issubclass(PASTS[name], SplitCovarianceIntersection) else {}
-        return PASTS[name](world_of(scenario), scenario.kind_of, relabellings, errors=errors, **more).make()
+        module, kind = PASTS[name]
+        estimator = getattr(import_module(f"stochfuse.estimators.{module}"), kind)
+        more = {"criterion": criterion} if name in INTERSECTIONS else {}
+        return estimator(world_of(scenario), scenario.kind_of, relabellings, errors=errors, **more).make()
     everyone = tuple(range(scenario.network.agents))
     # records tell like agents apart; footprints only say whose noise is whose
     labels = everyone if errors or records is not None else scenario.sensor_of
@@ -94,6 +97,18 @@ def _claims(ledger: Ledger, sources: Sources) -> InformationClaims:
     return InformationClaims(evaluate(ledger, sources))
 
 
+def _check_footprints(scenario: Scenario, name: str) -> None:
+    """Raise UsageError if an estimate's coefficients on all noises are too many to carry along."""
+    d, n, steps = scenario.model.dimension, scenario.network.agents, scenario.network.steps
+    measured = sum(scenario.sensors[kind].H.shape[-2] for kind in scenario.sensor_of)
+    numbers = d * (n * d + (steps - 1) * (d + measured))
+    if name not in WITHOUT_FOOTPRINTS and numbers > MOST_COEFFICIENTS:
+        raise UsageError(
+            f"estimator {name}: {steps} steps of {d} states are {numbers} coefficients on noises for every estimate; "
+            f"expected at most {MOST_COEFFICIENTS}, or quantity claimed"
+        )
+
+
 def check(scenario: Scenario, name: str) -> None:
     """Raise UsageError if an estimator is not one for such a scenario."""
     who = f"estimator {name}"
@@ -103,5 +118,6 @@ def check(scenario: Scenario, name: str) -> None:
         raise UsageError(f"{who}: expected one model for all agents, got parallel filters ([[agent]] F, Q, P, M or s)")
     if name == "optimal":
         require_independent_noise(scenario, who)
-    if name in PASTS and not PASTS[name].takes_late and scenario.network.delay != (1.0,):
+    takes_late = name in SUMS or (name in INTERSECTIONS and not scenario.own)
+    if not takes_late and scenario.network.delay != (1.0,):
         raise UsageError(f"{who}: expected messages without delay, got network.delay")

@@ -27,6 +27,7 @@ from stochfuse.errors import Problem, ScenarioError, UsageError
 from stochfuse.fusion.cooperative import Relation
 from stochfuse.metrics import metric as metric_of
 from stochfuse.model import Filter, Model, Noise, Sensor
+from stochfuse.names import ESTIMATORS, METHODS
 from stochfuse.network import LinkRows, Network, default_rows, restricted, stacked_rows, uniform_rows
 from stochfuse.tables.model import read_filters, read_link, read_model, read_network, read_sensors
 from stochfuse.tables.noise import read_noise
@@ -60,6 +61,7 @@ class Scenario:
     process : (Σd_i, Σd_i) process noise of all parallel filters together, or None if they have nothing in common.
     relations : what agent i measures of agent j, by (i, j) counted from 0.
     agent : number of the agent that the scenario asks to be shown, or None.
+    method, estimator, runs : what the scenario asks to be predicted by, or None.
     """
 
     name: str
@@ -79,11 +81,14 @@ class Scenario:
     process: np.ndarray | None = None
     relations: Mapping[tuple[int, int], Relation] = field(default_factory=dict)
     agent: int | None = None
+    method: str | None = None
+    estimator: str | None = None
+    runs: int | None = None
 
     @property
     def kind_of(self) -> tuple[int, ...]:
         """Kind of every agent: those of one kind may change places."""
-        alike = not self.own and not self.filters
+        alike = one_state(self)
         if self.noise is not None:
             c = self.noise.correlation
             alike &= len(set(c[~np.eye(len(c), dtype=bool)])) <= 1 and self.noise.disturbance is None
@@ -119,9 +124,14 @@ class Scenario:
         return {"schema": SCHEMA, **copy.deepcopy(dict(self.source))}
 
 
+def one_state(scenario: Scenario) -> bool:
+    """Whether all agents track the state of one model."""
+    return not scenario.own and not scenario.filters
+
+
 def require_one_state(scenario: Scenario, who: str) -> None:
     """Raise UsageError unless all agents track the state of one model."""
-    if scenario.own or scenario.filters:
+    if not one_state(scenario):
         what = "states of their own (model.own)" if scenario.own else "filters of their own"
         raise UsageError(f"{who}: expected agents that track one state by one model, got agents with {what}")
 
@@ -314,6 +324,9 @@ def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> S
     if network is not None and len(sensor_of) == network.agents:
         noise, process = read_noise(check, tables["noise"], [sensors[s] for s in sensor_of], filters, own)
     relations = _relations(check, mapping, model, network, own)
+    method = check.choice("report.method", tables["report"].get("method"), METHODS)
+    estimator = check.choice("report.estimator", tables["report"].get("estimator"), ESTIMATORS)
+    runs = check.integer("report.runs", tables["report"].get("runs"), 2)
     agent = check.integer("report.agent", tables["report"].get("agent"), 1)
     if agent is not None and network is not None and agent > network.agents:
         check.note("report.agent", f"an agent from 1 to {network.agents}", str(agent))
@@ -347,6 +360,9 @@ def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> S
         process=process,
         relations=relations,
         agent=agent,
+        method=method,
+        estimator=estimator,
+        runs=runs,
     )
 
 

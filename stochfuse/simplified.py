@@ -39,7 +39,7 @@ from stochfuse.engines.mean_field import Case, Outcomes, run, run_like
 from stochfuse.errors import UsageError
 from stochfuse.kalman import Estimate, from_information, to_information, update, update_information
 from stochfuse.network import LinkRows, number_of_senders, possible_senders, require_memoryless
-from stochfuse.scenario import Scenario
+from stochfuse.scenario import Scenario, require_independent_noise, require_one_state
 
 MOST_OUTCOMES = 100_000
 """Sets of senders (counted by kind of sensor) beyond which unlike agents are refused."""
@@ -117,8 +117,11 @@ def covariances(scenario: Scenario, rows: LinkRows) -> Covariances:
     Raises
     ------
     UsageError
-        If messages are delayed, or unlike agents make too many outcomes.
+        If messages are delayed, unlike agents make too many outcomes, or agents do not track one state with independent
+        noises.
     """
+    require_one_state(scenario, "method simplified")
+    require_independent_noise(scenario, "method simplified")
     steps, links = scenario.network.steps, len(rows.link)
     parts, forms, all_groups = [], set(), groups(scenario, rows)
     for group in all_groups:

@@ -21,7 +21,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from stochfuse.errors import UsageError
 from stochfuse.information import Sources
@@ -94,9 +93,7 @@ def world_of(scenario: Scenario) -> World:
         P0=P0,
         correlation=None if scenario.noise is None else scenario.noise.correlation,
         disturbance=None if scenario.noise is None else scenario.noise.disturbance,
-        error=None
-        if b is None
-        else np.concatenate([b if f.dimension == len(b) else np.linalg.pinv(f.M) @ b for f in filters]),
+        error=None if b is None else np.concatenate([np.linalg.pinv(f.M) @ b for f in filters]),
         own=scenario.own,
         relations=scenario.relations,
         M=tuple(f.M for f in filters) if scenario.filters and not scenario.own else None,
@@ -110,6 +107,8 @@ def _filter(scenario: Scenario) -> Filter:
 
 def _stacked(blocks: Sequence[np.ndarray], steps: int) -> np.ndarray:
     """Block diagonal matrix, per step where one of the blocks is."""
+    from scipy.linalg import block_diag
+
     if any(block.ndim > 2 for block in blocks):
         return np.array([block_diag(*(at_step(block, step) for block in blocks)) for step in range(1, steps + 1)])
     return np.asarray(block_diag(*blocks))

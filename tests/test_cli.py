@@ -182,7 +182,16 @@ def test_scenario_from_standard_input_file_and_json(tmp_path):
 
 def test_scenario_commands(tmp_path):
     listing = strict_json(run("scenario", "list", "-f", "json").stdout)
-    assert [entry["name"] for entry in listing] == ["cv-2d", "fcs-demo", "thesis-steady", "thesis-transient"]
+    assert [entry["name"] for entry in listing] == [
+        "beacon-map",
+        "cooperative-pnt",
+        "cv-2d",
+        "fcs-demo",
+        "gps-ins",
+        "parallel-filters",
+        "thesis-steady",
+        "thesis-transient",
+    ]
     assert "fcs-demo" in run("scenario", "list").stdout
     assert (
         run("scenario", "check", "fcs-demo").stdout

@@ -512,7 +512,10 @@ GOOD = Signal(np.zeros((2, 1)), A, B)
     ("signals", "message"),
     [
         ([GOOD], r"signals: expected two or more, got 1"),
-        ([GOOD, GOOD._replace(A1=np.diag([1.0, -1.0]))], r"signals\[2\]\.A1: expected .*semi-definite 2?.*indefinite"),
+        (
+            [GOOD, GOOD._replace(A1=np.diag([1.0, -1.0]))],
+            r"signals\[2\]\.A1: expected .*semi-definite 2?.*a variance of -1",
+        ),
         (
             [GOOD, GOOD._replace(A2=np.array([[1.0, 0.5], [0.0, 1.0]]))],
             r"signals\[2\]\.A2: expected .*, got an asymmetric",

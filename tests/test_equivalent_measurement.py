@@ -185,7 +185,7 @@ def test_a_given_epsilon_is_used_and_refused_where_a_single_sensor_is_better():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((-np.eye(2), 2), "R: expected a positive semi-definite matrix, got an indefinite one .smallest eigenvalue"),
+        ((-np.eye(2), 2), "R: expected a positive semi-definite matrix, got a variance of -1 on the diagonal"),
         (
             (np.eye(2), 2, np.array([[1.0, 2], [2, 1]])),
             r"Delta: expected a positive semi-definite matrix, got an indefinite one \(smallest eigenvalue.* -1\)",

@@ -190,7 +190,7 @@ BAD = [
         [{}, {"H": [[1, 0], [0, 1]]}, {}],
         "agent[2].R: expected a 2×2 matrix, to go with its own H, got nothing",
     ),
-    ("agent", [{}, {"Q": 1}, {}], "agent[2].Q: expected a known key, got an unknown one, 'Q'"),
+    ("agent", [{}, {"Z": 1}, {}], "agent[2].Z: expected a known key, got an unknown one, 'Z'"),
     ("report", {"metric": 3}, "report.metric: expected text, got 3"),
     (
         "report",
@@ -258,7 +258,7 @@ def test_malformed_files_name_the_place(tmp_path, text, message):
 
 def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(
-        sf.ScenarioError, match=r"nothing.toml: no such file, and no preset of that name \(presets: cv-2d"
+        sf.ScenarioError, match=r"nothing.toml: no such file, and no preset of that name \(presets: beacon-map"
     ):
         sf.load_scenario(tmp_path / "nothing.toml")
     with pytest.raises(sf.ScenarioError, match="cannot be read: Is a directory"):

@@ -9,11 +9,12 @@ a root finder.  Histories are those of `textbook.histories`: every one, nothing 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.optimize import brentq, minimize
+from scipy.optimize import minimize, root_scalar
 
 from tests import textbook
 
@@ -21,9 +22,9 @@ from tests import textbook
 class Local(NamedTuple):
     """Claimed covariance P, error coefficients e, and the part K R Kᵀ of P that this step's measurement brought."""
 
-    P: np.ndarray
-    e: np.ndarray
-    fresh: np.ndarray
+    P: Any
+    e: Any
+    fresh: Any = 0.0
 
 
 def at(M, k):
@@ -32,7 +33,7 @@ def at(M, k):
 
 def slices(sizes):
     ends = np.cumsum([0, *sizes])
-    return [slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    return [slice(a, b) for a, b in pairwise(ends)]
 
 
 class Truth:
@@ -234,8 +235,7 @@ def _weights(signals, information, slope):
         w = np.array(
             [np.mean([x for x, other in zip(w, signals, strict=True) if _equal(one, other)]) for one in signals]
         )
-    C = np.linalg.inv(information(w))
-    return [x * C @ H.T @ np.linalg.inv(A1 + x * A2) for x, (A1, A2, H) in zip(w, signals, strict=True)], C
+    return w
 
 
 def _equal(one, other):
@@ -245,7 +245,9 @@ def _equal(one, other):
 
 
 def _minimised(value, slope, start):
-    """Brent's method between two; of more SLSQP, then Newton's method on the weights above zero until their slopes are equal; signs of the others checked."""
+    """Brent's method between two weights.  Of more, SLSQP, then Newton's method on those above zero until their slopes
+    are equal; the others' must not be lower.
+    """
     n = len(start)
     if n == 2:
         return _between(lambda w: np.subtract(*slope(np.array([w, 1 - w]))))
@@ -254,7 +256,7 @@ def _minimised(value, slope, start):
         constraints={"type": "eq", "fun": lambda w: w.sum() - 1, "jac": lambda w: np.ones(n)},
     )  # fmt: skip
     w = np.maximum(found.x, 0) / np.maximum(found.x, 0).sum()
-    free = w > 1e-5
+    free, g = w > 1e-5, slope(w)
     for _ in range(20):
         w = _polished(slope, np.where(free, w, 0.0) / np.where(free, w, 0.0).sum(), free)
         g = slope(w)
@@ -269,9 +271,10 @@ def _minimised(value, slope, start):
 
 
 def _between(rise):
-    if rise(0.0) >= 0 or rise(1.0) <= 0:
-        return np.array([0.0, 1.0]) if rise(0.0) >= 0 else np.array([1.0, 0.0])
-    w = brentq(rise, 0, 1, xtol=1e-15, rtol=1e-15)
+    tiny = 1e-12
+    if rise(tiny) >= 0 or rise(1 - tiny) <= 0:
+        return np.array([0.0, 1.0]) if rise(tiny) >= 0 else np.array([1.0, 0.0])
+    w = root_scalar(rise, bracket=(tiny, 1 - tiny), xtol=1e-15, rtol=1e-15).root
     return np.array([w, 1 - w])
 
 
@@ -308,18 +311,21 @@ class Rule:
     def __init__(self, truth):
         self.t, self.locals = truth, {}
 
-    def begin(self):
+    def begin(self) -> Any:
         return [self.t.first(i) for i in range(self.t.n)]
 
-    def go_on(self, k, fused, before):
+    def go_on(self, k, fused, before) -> Any:
         return [self.t.local(i, k, one) for i, one in enumerate(fused)]
 
-    def exchange(self, k, now, heard, late):
+    def exchange(self, k, now, heard, late) -> Any:
         """Fused Locals; heard[i] others heard in order, late[i] Locals brought forward that come late."""
         return [self.fuse(k, i, now, heard[i], late[i]) for i in range(self.t.n)]
 
-    def shown(self, k, fused):
+    def shown(self, k, fused) -> Any:
         return [(one.P, one.e) for one in fused]
+
+    def fuse(self, k, i, now, heard, late) -> Any:
+        raise NotImplementedError
 
 
 class StandAlone(Rule):
@@ -365,13 +371,13 @@ class Blender(Rule):
         t, members = self.t, [i, *heard]
         e = [t.M[j] @ now[j].e for j in members]
         weights = self.weights([each[:, :-1] for each in e])
-        blended = sum(B @ each for B, each in zip(weights, e, strict=True))
+        blended = np.sum([B @ each for B, each in zip(weights, e, strict=True)], axis=0)
         return Local(blended[:, :-1] @ t.told @ blended[:, :-1].T, blended, 0)
 
     def weights(self, e):
         """A tree of two-input blenders: B_2 = (P_1 − P_12)(P_1 + P_2 − P_12 − P_21)⁺."""
         one, D = e[0], len(e[0])
-        weights = [np.eye(D)]
+        weights: list[Any] = [np.eye(D)]
         for other in e[1:]:
             P1, P2, P12 = (a @ self.t.told @ b.T for a, b in ((one, one), (other, other), (one, other)))
             B = (P1 - P12) @ np.linalg.pinv(P1 + P2 - P12 - P12.T, rcond=1e-11, hermitian=True)
@@ -430,7 +436,7 @@ class Equivalent(Rule):
             A = bounded(np.exp(u))[0]
             return np.trace(A @ (R - Delta * np.exp(-2 * u)) @ A.T)
 
-        return bounded(np.exp(brentq(slope, -20, 20, xtol=1e-15, rtol=1e-15)))
+        return bounded(np.exp(root_scalar(slope, bracket=(-20, 20), xtol=1e-15, rtol=1e-15).root))
 
 
 class Independent(Equivalent):
@@ -520,15 +526,17 @@ def of_histories(source, name):
         for k in range(1, t.steps + 1):
             key = tuple(map(frozenset, history[:k]))
             likely[key] = likely.get(key, 0.0) + probability
-    reached = {(): (None, [])}
+    reached, opened = {(): (None, [])}, {}
     for key, probability in sorted(likely.items(), key=lambda item: len(item[0])):
-        k, (fused, befores) = len(key), reached[key[:-1]]
-        now = rule.begin() if k == 1 else rule.go_on(k, fused, befores[-1])
-        befores = [*befores, now]
+        k, past = len(key), key[:-1]
+        if past not in opened:
+            fused, befores = reached[past]
+            opened[past] = [*befores, rule.begin() if k == 1 else rule.go_on(k, fused, befores[-1])]
+        befores = opened[past]
         heard = [sorted(j for j, r, sent in key[-1] if r == i and sent == k) for i in range(t.n)]
         late = [[_brought(t, i, befores[sent - 1][j], sent, k) for j, r, sent in sorted(key[-1]) if r == i and sent < k]
                 for i in range(t.n)]  # fmt: skip
-        fused = rule.exchange(k, now, heard, late)
+        fused = rule.exchange(k, befores[-1], heard, late)
         reached[key] = fused, befores
         yield k, probability, [t.moments(*each) for each in rule.shown(k, fused)]
 
@@ -541,7 +549,7 @@ def _brought(t, i, one, sent, k):
 
 def expected(source, name):
     """Expected claimed and actual covariance, bias and mean squared error, each [step][agent]."""
-    total = {}
+    total: dict[str, Any] = {}
     for k, probability, agents in of_histories(source, name):
         for q, quantity in enumerate(("claimed", "actual", "bias", "rms")):
             found = probability * np.array([moments[q] for moments in agents])

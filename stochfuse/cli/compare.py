@@ -109,7 +109,10 @@ def compare(
     from stochfuse.metrics import metric as metric_of
 
     check_files(output, plot, scenario)
-    names = None if estimator is None else [name.strip() for name in estimator.split(",")]
+    given, links = load(scenario, agents, steps, architecture, q, r, p0, link)
+    names = None if estimator is None else _names(estimator)
+    if names is None and methods is None and given.estimator is not None:
+        names = ["all"]  # a scenario for other estimators than those of the thesis' methods
     several = names is not None and (len(names) > 1 or methods is None or names == ["all"])
     ways = ["general", "simplified", "naive", "monte-carlo"] if methods is None else _names(methods)
     if several and methods is not None and len(ways) > 1:
@@ -130,7 +133,6 @@ def compare(
     if all_steps and not several:
         raise UsageError("--all-steps: expected several estimators")
     quantities = quantity_names(quantity or ("claimed,actual,consistency" if several else "claimed"))
-    given, links = load(scenario, agents, steps, architecture, q, r, p0, link)
     chosen, chosen_agent = metric_of(metric or given.metric or "trace", given.model), whose(agent, given)
     shown = _Shown(chosen, chosen_agent, digits, format, output, plot)
     if several:

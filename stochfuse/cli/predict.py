@@ -65,7 +65,13 @@ def predict(
     r: ROption = None,
     p0: P0Option = None,
     architecture: ArchitectureOption = None,
-    method: Annotated[Method, typer.Option(help="How to average over which messages arrive.")] = Method.simplified,
+    method: Annotated[
+        Method | None,
+        typer.Option(
+            help="How to average over which messages arrive; default: the scenario's, else simplified.",
+            show_default=False,
+        ),
+    ] = None,
     estimator: EstimatorOption = None,
     quantity: QuantityOption = "claimed",
     metric: MetricOption = None,
@@ -108,9 +114,10 @@ def predict(
     chosen = metric_of(metric or given.metric or "trace", given.model)
     for name in quantities:
         check(name, chosen)
+    way = Method(given.method or "simplified") if method is None else method
     if statistic != "mean":
-        if method not in (Method.general, Method.naive):
-            raise UsageError(f"--statistic {statistic}: expected --method general or naive, got {method.value}")
+        if way not in (Method.general, Method.naive):
+            raise UsageError(f"--statistic {statistic}: expected --method general or naive, got {way.value}")
         if normalise:
             raise UsageError("--normalise: expected --statistic mean")
         from stochfuse.general import check_statistic
@@ -120,7 +127,7 @@ def predict(
     settings = {
         "steady": steady,
         **settings_for(
-            [method.value],
+            [way.value],
             estimator=estimator,
             max_graphs=max_graphs,
             prune=prune,
@@ -131,9 +138,9 @@ def predict(
         ),
     }
     chosen_agent = whose(agent, given)
-    with _progress(method) as settings["progress"]:
-        found = run(given, links, method.value, quantities, **settings)
-        at_zero = run(given, [0.0], method.value, quantities, **settings) if normalise else [None] * len(found)
+    with _progress(way) as settings["progress"]:
+        found = run(given, links, way.value, quantities, **settings)
+        at_zero = run(given, [0.0], way.value, quantities, **settings) if normalise else [None] * len(found)
     views = tuple(
         View(p, chosen, chosen_agent, baseline, digits, statistic) for p, baseline in zip(found, at_zero, strict=True)
     )

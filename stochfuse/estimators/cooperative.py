@@ -116,7 +116,7 @@ class Itns(RecursiveEstimator):
                 factor(world.true_noise(step)),
             )
         prior = predict(Estimate(x, before.P), F, at_step(world.Q, step), w)
-        x, P = itns_update(prior, H, R, v)
+        x, P = itns_update(prior, H, R, v) if p else prior
         return Worked(P, x)
 
     def _with_columns(
@@ -142,18 +142,18 @@ class Itns(RecursiveEstimator):
         P, x = before.P.copy(), None if before.x is None else before.x.copy()
         measured = [set(zip(rule[1::2], rule[2::2], strict=True)) for rule in rules]
         first = len(self.world.P0)
-        pairs = self.world.relations or dict.fromkeys(sorted(set().union(*measured)))
+        pairs = self.world.relations if self.world.own else sorted(set().union(*measured))
         for pair in pairs:
             here = np.array([pair in m for m in measured])
             H, R = self._between(step, pair)
-            columns = slice(first, first + (len(R) if self.world.relations else 0))
+            columns = slice(first, first + (len(R) if self.world.own else 0))
             first = columns.stop
             if not here.any():
                 continue
             z = None
             if x is not None:
                 z = np.zeros((len(H), x.shape[-1]))
-                if self.world.relations:
+                if self.world.own:
                     z[:, columns] = factor(R)
             estimate = itns_update(Estimate(None if x is None else x[here], P[here]), H, R, z)
             P[here] = estimate.P
@@ -164,7 +164,7 @@ class Itns(RecursiveEstimator):
     def _between(self, step: int, pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         """What one agent measures of another, over the joint state, and its noise."""
         (i, j), states = pair, self.world.states
-        if self.world.relations:
+        if self.world.own:
             H_i, H_j, R = (at_step(M, step) for M in self.world.relations[pair])
         else:
             d = states[i].stop - states[i].start

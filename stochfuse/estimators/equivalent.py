@@ -94,7 +94,11 @@ class EquivalentMeasurement(RecursiveEstimator):
             which = np.concatenate([np.arange(s.start, s.stop) for s in (self.world.measurements[j] for j in members)])
             R = self.world.joint_noise(step)[np.ix_(which, which)]
             Δ = None if self.world.disturbance is None else self.world.disturbance[np.ix_(which, which)]
-            fused = self.fused_measurement(R, len(members), Δ)
+            try:
+                fused = self.fused_measurement(R, len(members), Δ)
+            except UsageError as error:
+                agents = ", ".join(str(j + 1) for j in members)
+                raise UsageError(f"the noises of agents {agents} ([noise], [[agent]] R): {error}") from None
             self._fused[key] = fused, actual_error(fused.weights, R, Δ)
         return self._fused[key]
 

@@ -9,7 +9,8 @@ Agents that track one state fuse the estimates heard.  Agents with states of the
 they measured of each neighbour, z − H_j x̂_j, a signal about H_i x_i whose correlated part is H_j A_j1 H_jᵀ and whose
 independent part is H_j A_j2 H_jᵀ + R.
 
-Weights minimise the determinant, or another criterion.  A message that comes late is brought forward, and nothing of it is independent.
+Weights minimise the determinant, or another criterion.  A message that comes late is brought forward, and nothing of it
+is independent.
 """
 
 from __future__ import annotations
@@ -31,7 +32,6 @@ class SplitCovarianceIntersection(RecursiveEstimator):
     """The estimator; parameters are those of `RecursiveEstimator`, and the criterion that the weights minimise."""
 
     symmetric = (TOGETHER,)
-    takes_late = True
     split = True
     """Whether anything is taken for independent."""
 

@@ -146,7 +146,6 @@ class RecursiveEstimator:
     additive, joint = False, False
     symmetric: tuple[str, ...] = ()
     mixed: tuple[str, ...] = ()
-    takes_late = False
 
     def __init__(
         self,

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from stochfuse.algebra import NUMPY
+from stochfuse.checks import covariance_fault
 from stochfuse.errors import UsageError
 from stochfuse.fusion.intersection_slopes import Criterion
 
@@ -22,15 +23,9 @@ def covariance_part(name: str, value: Any, p: int | None) -> np.ndarray:
     kind = f"a symmetric positive semi-definite {'square' if p is None else f'{p}×{p}'} matrix"
     if A.ndim != 2 or not A.size or A.shape[0] != A.shape[1] or p not in (None, len(A)):
         raise UsageError(f"{name}: expected {kind}, got shape {A.shape}")
-    if not np.isfinite(A).all():
-        raise UsageError(f"{name}: expected {kind}, got a value that is not finite")
-    scale = np.sqrt(np.where(np.diag(A) > 0, np.diag(A), 1.0))
-    scaled = A / scale[:, None] / scale
-    if np.abs(scaled - scaled.T).max() > ROUNDING:
-        raise UsageError(f"{name}: expected {kind}, got an asymmetric one")
-    least = float(np.linalg.eigvalsh(NUMPY.symmetric(scaled))[0])
-    if least < -ROUNDING:
-        raise UsageError(f"{name}: expected {kind}, got an indefinite one (eigenvalue {least:.3g} at unit variances)")
+    fault = covariance_fault(A)
+    if fault is not None:
+        raise UsageError(f"{name}: expected {kind}, got {fault}")
     return NUMPY.symmetric(A)
 
 

@@ -62,8 +62,8 @@ def _hears(check: Checker, value: Any, agents: int, architecture: str) -> np.nda
     hears = np.zeros((agents, agents), dtype=bool)
     for i, others in enumerate(value):
         known = [j for j in others if isinstance(j, int) and 1 <= j <= agents and j != i + 1]
-        if len(known) < len(others):
-            check.note(f"network.hears[{i + 1}]", f"other agents from 1 to {agents}", shown(others))
+        if len(set(known)) < len(others):
+            check.note(f"network.hears[{i + 1}]", f"other agents from 1 to {agents}, each once", shown(others))
         hears[i, [j - 1 for j in known]] = True
     return hears
 
@@ -215,6 +215,9 @@ def read_sensors(
         else:
             # the model's sensor is for filters that have as many states as the model
             fitting = default if default is None or default.H.shape[-1] == size else None
+            for key in ("H", "R"):
+                if fitting is None and key not in table:
+                    check.note(f"{path}.{key}", "a sensor of its own, or sensor = false", "nothing")
             sensor = _sensor(check, path, table, size, network.steps, fitting)
         if sensor is None:
             continue
@@ -232,20 +235,26 @@ def read_filters(
     """Read the agents' own filters from [[agent]]; none where all have the model's."""
     tables = [table if isinstance(table, dict) else {} for table in agents or []]
     keys = ("F", "Q", "P") if own else ("F", "Q", "P", "M", "s")
-    if model is None or P0 is None or network is None or not any(key in table for table in tables for key in keys):
+    if model is None or P0 is None or network is None:
         return ()
-    found = [_filter(check, f"agent[{i}]", table, model, P0, network.steps) for i, table in enumerate(tables, start=1)]
+    for i, table in enumerate(tables, start=1):
+        for key in ("M", "s"):
+            if own and key in table:
+                check.note(f"agent[{i}].{key}", "nothing, since every agent has a state of its own", shown(table[key]))
+    if not any(key in table for table in tables for key in keys):
+        return ()
+    size = model.dimension if own else None
+    found = [
+        _filter(check, f"agent[{i}]", table, model, P0, network.steps, size) for i, table in enumerate(tables, start=1)
+    ]
     filters = tuple(f for f in found if f is not None)
-    for i, f in enumerate(filters, start=1):
-        if own and f.dimension != model.dimension:
-            check.note(f"agent[{i}].F", f"a {model.dimension}×{model.dimension} matrix", f"{f.dimension} states")
     return filters if len(filters) == len(found) else ()
 
 
 def _filter(
-    check: Checker, path: str, table: Mapping[str, Any], model: Model, P0: np.ndarray, steps: int
+    check: Checker, path: str, table: Mapping[str, Any], model: Model, P0: np.ndarray, steps: int, size: int | None
 ) -> Filter | None:
-    F = check.matrix(f"{path}.F", table.get("F"), None, None, steps) if "F" in table else model.F
+    F = check.matrix(f"{path}.F", table.get("F"), size, size, steps) if "F" in table else model.F
     if F is None or F.shape[-1] != F.shape[-2]:
         if F is not None:
             check.note(f"{path}.F", "a square matrix", f"a {F.shape[-2]}×{F.shape[-1]} matrix")

@@ -119,6 +119,9 @@ class ReportTable(Table):
     """How results are shown where the command does not say."""
 
     metric: str | None = Field(None, description="default metric, as --metric takes it")
+    method: str | None = Field(None, description="default method, as --method takes it")
+    estimator: str | None = Field(None, description="default estimator, as --estimator takes it")
+    runs: int | None = Field(None, ge=2, strict=True, description="default runs of method monte-carlo")
     agent: int | None = Field(None, ge=1, strict=True, description="whose estimate is shown; default: the mean")
 
 
@@ -149,6 +152,7 @@ _KINDS = {
     "int_from_float": "a whole number",
     "float_type": "a number",
     "list_type": "a list",
+    "bool_type": "true or false",
     "model_type": "a table",
     "dict_type": "a table",
     "model_attributes_type": "a table",
