@@ -198,12 +198,23 @@ def test_scenario_commands(tmp_path):
         == "fcs-demo: ok: 10 agents, ad-hoc, 10 steps, state (x, vx, y, vy)\n"
     )
     schema = strict_json(run("scenario", "schema").stdout)
-    assert set(schema["properties"]) == {"schema", "description", "model", "initial", "network", "agent", "report"}
+    assert set(schema["properties"]) == {
+        "schema",
+        "description",
+        "model",
+        "initial",
+        "navigation",
+        "network",
+        "noise",
+        "cooperative",
+        "agent",
+        "report",
+    }
     new = tmp_path / "new.toml"
     run("scenario", "new", "--output", str(new))
     assert "ok: 3 agents" in run("scenario", "check", str(new)).stdout
     assert "new.toml exists already" in run("scenario", "new", "--output", str(new), code=2).stderr
-    assert "no preset 'nothing'; the presets are cv-2d" in run("scenario", "new", "nothing", code=2).stderr
+    assert "no preset 'nothing'; the presets are beacon-map" in run("scenario", "new", "nothing", code=2).stderr
 
 
 def test_derive_agrees_with_predict(tmp_path):

@@ -16,12 +16,14 @@ from rich.table import Table
 
 import stochfuse as sf
 from tests import textbook
-from tests.benchmarks import chain, literal
+from tests.benchmarks import chain, intersection, literal
 from tests.strategies import mapping
 from tests.test_accuracy import CASES
 
 HERE = Path(__file__).parent
 LINK = np.linspace(0, 1, 1001)
+LINKS = {"'gps-ins'": [round(0.1 * i, 1) for i in range(11)]}
+"""Link probabilities of the cases that are not measured at 0.5."""
 
 
 def medians(*functions: Callable[[], object], rounds: int) -> list[float]:
@@ -107,12 +109,13 @@ def absolute(quick: bool) -> list[tuple[str, ...]]:
         ("broadcast, 7 steps", "steps=7, architecture='broadcast'", "'general'", "20 s"),
         ("cyclic, 7 steps", "steps=7, architecture='cyclic'", "'general'", "20 s"),
         ("Monte Carlo, ad hoc, 5 steps, 50,000 runs", "", "'monte-carlo', runs=50_000, workers=2", "4 s"),
+        ("GPS/INS, 100 s, 11 µ, 100 runs, claimed and actual", "'gps-ins'", "quantity='actual'", "10 s"),
     ]
     rows = []
     for name, scenario, method, bound in work[:1] if quick else work:
         code = (
             "import resource, time, stochfuse as sf; start = time.perf_counter(); "
-            f"sf.predict(sf.load_scenario({scenario}), [0.5], {method}).values(); "
+            f"sf.predict(sf.load_scenario({scenario}), {LINKS.get(scenario, [0.5])}, {method}).values(); "
             "print(time.perf_counter() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3)"
         )
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -151,11 +154,16 @@ def main() -> None:
     rows = [many_agents("thesis-transient", rounds), many_agents("cv-2d", rounds)]
     show("Cost against the number of agents, 1001 µ × 5 steps", ("work", "few", "many", "ratio", "bound", ""), rows)
     show(
+        "Covariance intersection of 4×4 pairs, in one run; error in ω against the root of the derivative",
+        intersection.HEADINGS,
+        intersection.report(quick),
+    )
+    show(
         "Enumeration against plain enumeration, in one run",
         ("work", "plain", "stochfuse", "times faster", "bound", "largest relative difference"),
         [enumeration(2 if quick else 3)],
     )
-    show("Three agents, scalar, one µ: seconds here", ("work", "time", "memory", "bound"), absolute(quick))
+    show("Three agents: seconds here", ("work", "time", "memory", "bound"), absolute(quick))
     show(
         "Contact chain and message load: seconds here",
         ("work", "time", "bound of the value", "promised"),

@@ -7,19 +7,18 @@ derivative (`scipy.optimize.root_scalar` on the literal expression; 50 digits fo
 
 from __future__ import annotations
 
-import statistics
 import time
-from collections.abc import Callable
 
 import mpmath as mp
 import numpy as np
 from scipy.optimize import minimize_scalar, root_scalar
 
 from stochfuse.fusion.covariance_intersection import Criterion, fuse_stack, pair_weights
+from tests.benchmarks.chain import seconds
 
 D = 4
 HEADINGS = (
-    "10,000 pairs",
+    "pairs",
     "criterion",
     "SciPy loop",
     "weights",
@@ -96,17 +95,6 @@ def to_fifty_digits(a: np.ndarray, b: np.ndarray, criterion: str) -> float:
         return float(low)
 
 
-def seconds(function: Callable[[], object], rounds: int) -> float:
-    """Median of some rounds, after one that is not counted."""
-    function()
-    times = []
-    for _ in range(rounds):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
-
-
 def errors(kind: str, A: np.ndarray, B: np.ndarray, criterion: str, w: np.ndarray, sample: int) -> float:
     """Largest error of the weights: known ones where pairs are equal or nested, else roots on a sample."""
     if kind == "equal":
@@ -137,5 +125,5 @@ def report(quick: bool) -> list[tuple[str, ...]]:
             differs = "" if kind == "equal" else f"{np.abs(plain - w).max():.0e}"
             error = errors(kind, A, B, criterion, w, 40 if quick else 1000)
             times = f"{loop:.3g} s", f"{mine * 1e3:.3g} ms", f"{loop / mine:.0f}", f"{whole * 1e3:.3g} ms"
-            rows.append((kind, criterion, *times, "≥ 40, 1e-9", differs, f"{error:.0e}"))
+            rows.append((f"{count:,} {kind}", criterion, *times, "≥ 40, 1e-9", differs, f"{error:.0e}"))
     return rows
