@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from stochfuse.errors import UsageError
-from stochfuse.estimators.recursion import RecursiveEstimator, Rule, Worked
+from stochfuse.estimators.pasts import Rule
+from stochfuse.estimators.recursion import RecursiveEstimator, Worked
 from stochfuse.fusion.equivalent_measurement import (
     Equivalent,
     actual_error,

@@ -20,7 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse.estimators.recursion import RecursiveEstimator, Rule, Worked
+from stochfuse.estimators.pasts import Rule
+from stochfuse.estimators.recursion import RecursiveEstimator, Worked
 from stochfuse.fusion.covariance_intersection import Criterion, fuse_stack
 from stochfuse.model import at_step
 from stochfuse.world import World
