@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import log2
 from typing import Any
 
 import numpy as np
 
 from stochfuse.engines.enumeration import TooManyError
 from stochfuse.errors import NoAnswerError, UsageError
+from stochfuse.events import events
 from stochfuse.methods import ESTIMATORS, METHODS, choose, predict
 from stochfuse.metrics import Metric
 from stochfuse.prediction import Prediction
 from stochfuse.quantities import QUANTITIES
-from stochfuse.scenario import Scenario
+from stochfuse.scenario import Scenario, link_rows
 
 DEFAULT_METHODS = ("general", "simplified", "naive", "monte-carlo")
 EXACT_FIRST = ("general", "optimal", "simplified", "naive", "monte-carlo")
@@ -103,8 +105,8 @@ def _predict(scenario: Scenario, link: Any, method: str, settings: dict[str, Any
         raise UsageError(f"{method} cannot be compared here, leave it out of the methods: {error}") from None
 
 
-EASY = 2000
-"""Graphs up to which outcomes are enumerated without being asked to."""
+EASY, EASY_EXCHANGE = 2000, 12
+"""Graphs, and binary logarithm of the outcomes of one exchange, up to which outcomes are enumerated unasked."""
 SIDE_BY_SIDE = ("claimed", "actual", "consistency")
 
 
@@ -146,8 +148,8 @@ def compare_estimators(
     ----------
     scenario, link : as for `predict`.
     estimators : names out of `stochfuse.methods.ESTIMATORS`; default: all that the scenario takes.
-    method : "general" or "monte-carlo"; default: exact where up to `EASY` graphs (or `max_graphs`) have to be carried,
-        else sampled, with the same arrivals for all estimators.
+    method : "general" or "monte-carlo"; default: exact where up to `EASY` graphs (or `max_graphs`) have to be carried
+        and no runs are asked for, else sampled, with the same arrivals for all estimators.
     quantities : what is to be compared; bias and rms make a note of an initial error that is not known.
     **settings : as for `predict`.
 
@@ -186,6 +188,10 @@ def _estimated(
     if method is not None:
         return predict(scenario, link, method, quantity, estimator=estimator, **settings)
     easy = {"max_graphs": EASY, **settings, "progress": None}
+    network = scenario.network
+    exchange = len(events(network, link_rows(scenario, link), 1)) * log2(len(network.delay) + 1)
+    if {"runs", "seed", "workers"} & set(settings) or exchange > EASY_EXCHANGE:
+        return predict(scenario, link, "monte-carlo", quantity, estimator=estimator, **settings)
     try:
         return predict(scenario, link, "general", quantity, estimator=estimator, **easy)
     except TooManyError:

@@ -28,7 +28,7 @@ from stochfuse.errors import UsageError
 from stochfuse.events import events
 from stochfuse.methods import RUNS, SEED, choose, predict
 from stochfuse.network import LinkRows, require_memoryless
-from stochfuse.scenario import Scenario, link_rows
+from stochfuse.scenario import Scenario, link_rows, require_one_state
 
 RULES = ("local-fusion-graph", "naive")
 METHODS = ("exact", "monte-carlo")
@@ -172,6 +172,7 @@ def message_load(
     for name, value, least in (("runs", runs, 2), ("seed", seed, 0)):
         if value < least:
             raise UsageError(f"{name}: expected a whole number of at least {least}, got {value}")
+    require_one_state(scenario, "message load")
     network, rows = scenario.network, link_rows(scenario, link)
     if network.delay != (1.0,):
         raise UsageError("network.delay: expected none for message loads, which are counted without delay")

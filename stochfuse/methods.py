@@ -52,6 +52,10 @@ class Settings:
 
 
 NAIVE = "naive fusion counts shared information again and believes it; quantity actual is its true error"
+CENTRE = (
+    "what agents measure themselves reaches the centre of ITNS without a link, only agreement between them depends on "
+    "the links: not to be compared with the optimum of what arrived"
+)
 NO_ERROR = "the scenario has no known initial error (initial.error): the bias is 0, the RMS error that of the noise"
 
 
@@ -123,6 +127,8 @@ def predict(
         "monte-carlo": lambda: _sampled(scenario, rows, how, errors),
     }
     parts = make[method]()
+    if parts.get("estimator") == "itns" and not scenario.own:
+        parts["notes"] = (*parts["notes"], CENTRE)
     if quantity in ("bias", "rms") and scenario.error is None:
         parts["notes"] = (*parts["notes"], NO_ERROR)
     prediction = Prediction(

@@ -15,4 +15,6 @@ ESTIMATORS = (
     "itns",
     "stand-alone",
 )
+INTERSECTIONS = ("covariance-intersection", "split-ci")
+"""Estimators whose weights minimise one of the criteria."""
 CRITERIA = ("det", "trace", "max-eig")

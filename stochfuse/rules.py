@@ -20,6 +20,7 @@ from stochfuse.estimators.local_fusion_graph import LocalFusionGraph
 from stochfuse.estimators.naive import NaiveFusion
 from stochfuse.estimators.optimal import OptimalFusion
 from stochfuse.information import InformationClaims, Ledger, Sources, evaluate
+from stochfuse.names import INTERSECTIONS
 from stochfuse.scenario import Scenario, require_independent_noise
 from stochfuse.sources import error_sources, sources_of, world_of
 
@@ -41,7 +42,6 @@ PASTS = {
     "stand-alone": ("alone", "StandAlone"),
 }
 """Estimators that remember pasts: module in `stochfuse.estimators`, and class; imported when asked for."""
-INTERSECTIONS = ("covariance-intersection", "split-ci")
 WITH_OWN_STATES = ("covariance-intersection", "split-ci", "lwin", "itns", "stand-alone")
 WITH_OWN_FILTERS = ("blender", "joint-blender")
 WITHOUT_FOOTPRINTS = ("equivalent-measurement", "independent-measurements", "itns")
@@ -104,8 +104,8 @@ def _check_footprints(scenario: Scenario, name: str) -> None:
     numbers = d * (n * d + (steps - 1) * (d + measured))
     if name not in WITHOUT_FOOTPRINTS and numbers > MOST_COEFFICIENTS:
         raise UsageError(
-            f"estimator {name}: {steps} steps of {d} states are {numbers} coefficients on noises for every estimate; "
-            f"expected at most {MOST_COEFFICIENTS}, or quantity claimed"
+            f"estimator {name}: the actual error after {steps} steps of {d} states has {numbers} coefficients on "
+            f"noises, expected at most {MOST_COEFFICIENTS}: take fewer steps, or quantity claimed"
         )
 
 

@@ -30,6 +30,8 @@ MOST_AGENTS, MOST_NUMBERS = 60, 500_000_000
 """Agents whose sets fit a machine word, and claimed values that a sample may hold."""
 MANY = 10_000
 """Runs, over all rows, from which on another process pays for its start."""
+ROUNDING = 1e-13
+"""Standard error, relative to the value, that is rounding in runs that are all alike."""
 STEP = 1e-4
 """Share of a run's deviation from the mean over which the derivative of a metric is taken."""
 
@@ -77,7 +79,8 @@ class Sampled:
                     for h in (STEP, -STEP)
                 )
                 slope = (above - below) / (2 * STEP)
-                out[row, step] = np.sqrt((slope**2).sum() / (self.runs - 1) / self.runs)
+                error = np.sqrt((slope**2).sum() / (self.runs - 1) / self.runs)
+                out[row, step] = error if error > ROUNDING * np.abs(above).max() else 0.0
         return out
 
 

@@ -326,7 +326,11 @@ def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> S
     relations = _relations(check, mapping, model, network, own)
     method = check.choice("report.method", tables["report"].get("method"), METHODS)
     estimator = check.choice("report.estimator", tables["report"].get("estimator"), ESTIMATORS)
+    if estimator is not None and method not in (None, "general", "monte-carlo"):
+        check.note("report.estimator", 'report.method "general" or "monte-carlo", which average it', f'"{method}"')
     runs = check.integer("report.runs", tables["report"].get("runs"), 2)
+    if method is None and (estimator is not None or runs is not None):
+        method = "general" if runs is None else "monte-carlo"
     agent = check.integer("report.agent", tables["report"].get("agent"), 1)
     if agent is not None and network is not None and agent > network.agents:
         check.note("report.agent", f"an agent from 1 to {network.agents}", str(agent))

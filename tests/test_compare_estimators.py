@@ -57,8 +57,9 @@ def test_table_csv_and_python_agree():
 
 def test_what_is_too_much_to_enumerate_is_sampled_with_the_same_arrivals():
     s = sf.load_scenario("thesis-transient")
-    found = sf.compare_estimators(s, [0.5], ["naive", "lwin", "blender"], runs=50)
+    found = sf.compare_estimators(s, [0.5], ["naive", "lwin", "blender"])
     assert [p.nature for p in found.predictions] == ["sampled", "sampled", "exact"]
+    assert sf.compare_estimators(s, [0.5], ["blender"], runs=20).predictions[0].nature == "sampled"
     naive, lwin, _ = found.values("actual")
     np.testing.assert_allclose(naive, lwin, rtol=1e-9)
     exact = sf.compare_estimators(s.until(3), [0.5], ["naive"], "general")
@@ -128,11 +129,41 @@ def test_figure(against):
         (["--estimator", "split-ci", "--methods", "simplified"], "--estimator: expected method general or monte-carlo"),
         (["beacon-map", "--estimator", "naive,lwin"], "estimator naive: expected agents that track one state"),
         (["parallel-filters", "--estimator", "split-ci,blender"], "estimator split-ci: expected one model for all"),
+        (["--estimator", "naive,blender", "--criterion", "trace"], "--criterion: expected estimator covariance-inter"),
         (["--criterion", "size"], "'size' is not one of 'det', 'trace', 'max-eig'"),
     ],
 )
 def test_wrong_use(arguments, message):
     assert message in " ".join(run("compare", *arguments, code=2).stderr.split())
+
+
+def test_a_scenario_that_names_an_estimator_is_predicted_by_it(tmp_path):
+    file = tmp_path / "mine.toml"
+    text = run("scenario", "show", "thesis-transient").stdout.replace("steps = 5", "steps = 2")
+    file.write_text(text + '\n[report]\nestimator = "split-ci"\n')
+    assert "of split covariance intersection; exact" in run("predict", str(file)).stdout
+    assert (
+        "Monte Carlo of naive fusion"
+        in run("predict", str(file), "--method", "monte-carlo", "--estimator", "naive", "--runs", "5").stdout
+    )
+    file.write_text(text + '\n[report]\nestimator = "split-ci"\nruns = 7\n')
+    assert "sampled, 7 runs" in run("predict", str(file)).stdout
+    file.write_text(text + '\n[report]\nestimator = "split-ci"\nmethod = "simplified"\n')
+    message = 'report.estimator: expected report.method "general" or "monte-carlo", which average it, got "simplified"'
+    assert message in run("predict", str(file), code=2).stderr
+
+
+def test_no_two_curves_look_alike():
+    found = sf.compare_estimators(sf.load_scenario(steps=1), [0.0, 1.0])
+    from stochfuse.metrics import metric
+
+    figure = draw(EstimatorView(found, metric("trace", found.predictions[0].scenario.model)))
+    looks = [(line.get_color(), line.get_marker()) for line in figure.axes[1].lines[:-1]]
+    assert len(set(looks)) == len(looks) == len(ESTIMATORS)
+
+
+def test_message_load_is_of_agents_that_track_one_state():
+    assert "message load: expected agents that track one state" in run("messages", "beacon-map", code=2).stderr
 
 
 def test_methods_that_cannot_take_a_scenario_say_so():
@@ -142,5 +173,5 @@ def test_methods_that_cannot_take_a_scenario_say_so():
             sf.predict(s, [0.5], method)
     with pytest.raises(UsageError, match=r"the optimum: expected independent measurement noises, got \[noise\]"):
         sf.predict(sf.load_scenario("gps-ins"), [0.5], "optimal")
-    with pytest.raises(UsageError, match="coefficients on noises for every estimate; expected at most 20000"):
+    with pytest.raises(UsageError, match="coefficients on noises, expected at most 20000"):
         sf.predict(sf.load_scenario("gps-ins"), [0.5], "monte-carlo", "actual", estimator="split-ci")

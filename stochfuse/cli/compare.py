@@ -107,6 +107,7 @@ def compare(
     """
     from stochfuse.errors import UsageError
     from stochfuse.metrics import metric as metric_of
+    from stochfuse.names import INTERSECTIONS
 
     check_files(output, plot, scenario)
     given, links = load(scenario, agents, steps, architecture, q, r, p0, link)
@@ -130,6 +131,8 @@ def compare(
     for option, given_at_all in (("--reference", reference is not None), ("--relative", relative)):
         if several and given_at_all:
             raise UsageError(f"{option}: expected methods to compare, got several estimators")
+    if criterion is not None and several and names != ["all"] and not set(names or ()) & set(INTERSECTIONS):
+        raise UsageError(f"--criterion: expected estimator {' or '.join(INTERSECTIONS)}, got {estimator}")
     if all_steps and not several:
         raise UsageError("--all-steps: expected several estimators")
     quantities = quantity_names(quantity or ("claimed,actual,consistency" if several else "claimed"))
@@ -226,10 +229,13 @@ def _estimators(
     for prediction in found.predictions:
         for note in prediction.notes:
             typer.echo(f"note: {prediction.estimator}: {note}", err=True)
-    for views in view.views:
-        warning = views[0].overconfidence()
-        if warning:
-            typer.echo(f"warning: {views[0].prediction.estimator}: {warning}", err=True)
+    warnings = {views[0].prediction.estimator: views[0].overconfidence() for views in view.views}
+    warnings = {name: warning for name, warning in warnings.items() if warning}
+    if len(warnings) > 2:
+        typer.echo(f"warning: overconfident by more than 5 % somewhere: {', '.join(warnings)}", err=True)
+    else:
+        for name, warning in warnings.items():
+            typer.echo(f"warning: {name}: {warning}", err=True)
     if how.plot is not None:
         estimators.plot_estimators(view, how.plot)
     write_report(

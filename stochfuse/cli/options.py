@@ -132,7 +132,11 @@ PruneOption = Annotated[
 ]
 RunsOption = Annotated[
     int | None,
-    typer.Option(min=2, help="monte-carlo: independent runs per link probability; default: 1000.", show_default=False),
+    typer.Option(
+        min=2,
+        help="monte-carlo: independent runs per link probability; default: the scenario's, else 1000.",
+        show_default=False,
+    ),
 ]
 SeedOption = Annotated[
     int | None,

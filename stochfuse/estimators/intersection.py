@@ -3,7 +3,8 @@
 What an agent's own measurement brought in this step, K R Kᵀ, is its independent part; all else, prior and process
 noise, may be correlated with anything.  So at step 1, where nothing has been measured, an estimate has no independent
 part, even in a scenario whose first estimates are independent: the rule does not use that.  Plain covariance
-intersection takes nothing for independent.
+intersection takes nothing for independent.  Where measurement noises are correlated between agents, the split is wrong
+and the claim may be too small.
 
 Agents that track one state fuse the estimates heard.  Agents with states of their own fuse their estimate with what
 they measured of each neighbour, z − H_j x̂_j, a signal about H_i x_i whose correlated part is H_j A_j1 H_jᵀ and whose

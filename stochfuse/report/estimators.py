@@ -156,7 +156,7 @@ def estimator_json(view: EstimatorView) -> dict[str, Any]:
 
 
 def plot_estimators(view: EstimatorView, output: Path) -> None:
-    """Draw what is claimed and what is true after the last step against link probability, or a case's steps."""
+    """Draw what is claimed and what is true after the last step, against link probability or case, or a row's steps."""
     figure = draw(view)
     write_file(output, lambda path: figure.savefig(path, dpi=150))
 
@@ -165,40 +165,67 @@ def draw(view: EstimatorView):
     """Return the figure: a panel for quantities with the metric's unit, one for the ratio."""
     Figure = figure_class()
     from matplotlib.lines import Line2D
-    from matplotlib.ticker import MaxNLocator
 
     p = view.comparison.predictions[0]
-    against_link = p.cases is None and len(p.link) > 1
-    order = np.argsort(p.link)
-    x = p.link[order] if against_link else p.steps
     axis_of = [RATIO if q == "consistency" else view.views[0][c].axis for c, q in enumerate(view.quantities)]
     panels = list(dict.fromkeys(axis_of))
     figure = Figure(figsize=(2.0 + 4.6 * len(panels), 5.4), layout="constrained")
     axes_of = dict(zip(panels, figure.subplots(1, len(panels), squeeze=False)[0], strict=True))
     colors = [COLORS[e % len(COLORS)] for e in range(len(view.values))]
+    over_rows = len(p.link) > 1
+    order = np.argsort(p.link, kind="stable") if p.cases is None else np.arange(len(p.link))
+    x = p.steps if not over_rows else p.link[order] if p.cases is None else order
     for e, (values, color) in enumerate(zip(view.values, colors, strict=True)):
         for c, quantity in enumerate(view.quantities):
-            axes = axes_of[axis_of[c]]
-            y = values[c][order, -1] if against_link else values[c][-1]
-            marker = MARKERS[e % len(MARKERS)] if len(x) <= 30 else None
-            axes.plot(x, y, color=color, linestyle=STYLES[quantity], marker=marker, markersize=4, alpha=0.9)
+            y = values[c][order, -1] if over_rows else values[c][0]
+            style = "" if over_rows and p.cases is not None else STYLES[quantity]
+            # cases are no sequence: claimed is a hollow marker there
+            face = "none" if not style and quantity == "claimed" else color
+            marker = _marker(e) if len(x) <= 30 else None
+            size = 9 if not style and quantity == "claimed" else 5
+            axes_of[axis_of[c]].plot(
+                x, y, color=color, linestyle=style, marker=marker, markersize=size, markerfacecolor=face
+            )
     for label, axes in axes_of.items():
-        axes.set_ylabel(label)
-        axes.set_xlabel("link probability µ" if against_link else "step k")
-        if label == RATIO:
-            axes.axhline(1.0, color="0.3", linewidth=0.8)
-        elif "bias" not in view.quantities:
-            axes.set_ylim(bottom=0)
-        if not against_link:
-            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axes.grid(alpha=0.3)
+        _finish(axes, label, view, over_rows)
     names = [
-        Line2D([], [], color=color, marker=MARKERS[e % len(MARKERS)], markersize=4, label=name)
+        Line2D([], [], color=color, marker=_marker(e), markersize=5, label=name)
         for e, (name, color) in enumerate(zip(view.comparison.estimators, colors, strict=True))
     ]
-    kinds = [Line2D([], [], color="0.2", linestyle=STYLES[q], label=q) for q in view.quantities if q != "consistency"]
+    hollow = over_rows and p.cases is not None
+    kinds = [
+        Line2D([], [], color="0.2", linestyle=STYLES[q], label=q + " (hollow)" * (hollow and q == "claimed"))
+        for q in view.quantities
+        if q != "consistency"
+    ]
     figure.legend(handles=[*names, *kinds], fontsize="small", loc="outside lower center", ncols=4)
-    where = f"after step {p.steps[-1]}" if against_link else f"µ = {p.link[-1]:.3g}" if p.cases is None else p.cases[-1]
+    where = f"after step {p.steps[-1]}" if over_rows else p.cases[0] if p.cases else f"µ = {p.link[0]:.3g}"
     title = f"What estimators claim and what is true, {where}; {view.views[0][0].whom}"
-    figure.suptitle("\n".join(wrap(title, 45 * len(panels) + 15)), fontsize="medium")
+    lines = wrap(title, 45 * len(panels) + 15, break_on_hyphens=False)
+    figure.suptitle("\n".join(lines), fontsize="medium")
     return figure
+
+
+def _finish(axes: Any, label: str, view: EstimatorView, over_rows: bool) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    p = view.comparison.predictions[0]
+    axes.set_ylabel(label)
+    axes.grid(alpha=0.3)
+    if label == RATIO:
+        axes.axhline(1.0, color="0.3", linewidth=0.8)
+        low, high = axes.get_ylim()
+        axes.set_ylim(min(low, 0.9), max(high, 1.1))
+    elif axes.get_ylim()[0] > 0:
+        axes.set_ylim(bottom=0)
+    if over_rows and p.cases is not None:
+        axes.set_xticks(range(len(p.cases)), ["\n".join(wrap(case, 16)) for case in p.cases], fontsize="small")
+    else:
+        axes.set_xlabel("link probability µ" if over_rows else "step k")
+    if not over_rows:
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+
+
+def _marker(number: int) -> str:
+    """Marker of a curve; together with its colour there is none like it among 64."""
+    return MARKERS[(number + 3 * (number // len(COLORS))) % len(MARKERS)]

@@ -119,7 +119,9 @@ class ReportTable(Table):
     """How results are shown where the command does not say."""
 
     metric: str | None = Field(None, description="default metric, as --metric takes it")
-    method: str | None = Field(None, description="default method, as --method takes it")
+    method: str | None = Field(
+        None, description="default method; where an estimator is named general, where runs are monte-carlo"
+    )
     estimator: str | None = Field(None, description="default estimator, as --estimator takes it")
     runs: int | None = Field(None, ge=2, strict=True, description="default runs of method monte-carlo")
     agent: int | None = Field(None, ge=1, strict=True, description="whose estimate is shown; default: the mean")
