@@ -37,7 +37,8 @@ class Settings:
     prune : general, naive: leave the least likely graphs out where there are more, instead of giving up.
     runs, seed : monte-carlo: independent runs per link probability, and the seed.
     workers : monte-carlo: processes; default: one for small samples, else one per processor.
-    criterion : covariance-intersection, split-ci: what the weights minimise, "det", "trace" or "max-eig".
+    criterion : covariance-intersection, split-ci: what the weights minimise, "det", "trace" or "max-eig",
+        in each fusion by itself: over several steps that need not be the least.
     progress : told how far long work is, see `stochfuse.engines.enumeration.Progress`.
     """
 

@@ -158,7 +158,7 @@ DigitsOption = Annotated[int, typer.Option(min=1, max=17, help="Significant digi
 CriterionOption = Annotated[
     Criterion | None,
     typer.Option(
-        help="covariance-intersection, split-ci: what the weights minimise; default: det, whatever the units.",
+        help="covariance-intersection, split-ci: what the weights minimise in each fusion; default: det.",
         show_default=False,
     ),
 ]

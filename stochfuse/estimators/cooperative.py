@@ -101,12 +101,7 @@ class Itns(RecursiveEstimator):
 
     def _local(self, step: int, before: Worked) -> Worked:
         """Time update of the whole and all local measurements."""
-        world, F = self.world, self.world.joint_transition(step)
-        p = world.measurements[-1].stop
-        H = np.concatenate([world.joint_sensor(i, step) for i in range(world.agents)])
-        R = np.zeros((p, p))
-        for rows, own in zip(world.measurements, world.R, strict=True):
-            R[rows, rows] = at_step(own, step)
+        world = self.world
         x, w, v = None, None, None
         if self.errors:
             x, (w, v) = self._with_columns(
@@ -116,9 +111,14 @@ class Itns(RecursiveEstimator):
                 -factor(at_step(world.Q, step)),
                 factor(world.true_noise(step)),
             )
-        prior = predict(Estimate(x, before.P), F, at_step(world.Q, step), w)
-        x, P = itns_update(prior, H, R, v) if p else prior
-        return Worked(P, x)
+        prior = predict(Estimate(x, before.P), world.joint_transition(step), at_step(world.Q, step), w)
+        estimate = prior
+        for agent, rows in enumerate(world.measurements):
+            if rows.stop > rows.start:
+                z = None if v is None else v[rows]
+                estimate = itns_update(estimate, world.joint_sensor(agent, step), at_step(world.R[agent], step), z)
+        self.grown(prior.P, estimate.P)
+        return Worked(estimate.P, estimate.x)
 
     def _with_columns(
         self, step: int, root: np.ndarray, bias: np.ndarray, *noises: np.ndarray

@@ -21,9 +21,10 @@ from typing import Any
 
 import numpy as np
 
+from stochfuse.errors import UsageError
 from stochfuse.estimators.pasts import Rule
 from stochfuse.estimators.recursion import RecursiveEstimator, Worked
-from stochfuse.fusion.covariance_intersection import Criterion, fuse_stack
+from stochfuse.fusion.covariance_intersection import Criterion, Stack, fuse_stack
 from stochfuse.model import at_step
 from stochfuse.world import World
 
@@ -63,10 +64,19 @@ class SplitCovarianceIntersection(RecursiveEstimator):
         split = [self._split(each) for each in rests_on]
         known, independent = [c for c, _ in split], [i for _, i in split]
         if rules[0][0] == TOGETHER:
-            stack = fuse_stack(known, independent, criterion=self.criterion)
+            stack = self._stack(step, known, independent)
             x = None if rests_on[0].x is None else _sum(stack.gains, [each.x for each in rests_on])
             return Worked(stack.C, x)
         return self._related(step, rules[0][1:], rests_on, known, independent)
+
+    def _stack(self, step: int, known: Any, independent: Any, maps: Any = None) -> Stack:
+        try:
+            return fuse_stack(known, independent, maps, self.criterion)
+        except UsageError as error:
+            raise UsageError(
+                f"step {step}: intersections expect estimates that are known exactly in no direction (initial.P, "
+                f"model.Q, [[agent]] P and Q positive definite); got {error}"
+            ) from None
 
     def _split(self, worked: Worked) -> tuple[np.ndarray, np.ndarray]:
         nothing = np.zeros_like(worked.P)
@@ -92,7 +102,7 @@ class SplitCovarianceIntersection(RecursiveEstimator):
             independent[place] = H_j @ independent[place] @ H_j.T + (R if self.split else 0.0 * R)
             if self.footprints is not None:
                 signals.append(self.footprints.related(step, (agent, j)) - H_j @ rests_on[place].x)
-        stack = fuse_stack(known, independent, maps, self.criterion)
+        stack = self._stack(step, known, independent, maps)
         return Worked(stack.C, None if self.footprints is None else _sum(stack.gains, signals))
 
 

@@ -25,6 +25,9 @@ from stochfuse.model import at_step
 from stochfuse.quantities import Moments
 from stochfuse.world import Footprints, World
 
+MOST_MAGNIFIED = 1e13
+"""Growth of rounding, 2e-16 of the prior beside the posterior, from which on nothing is claimed."""
+
 
 class Worked(NamedTuple):
     """Stacks of estimates that a rule worked out.
@@ -88,6 +91,7 @@ class RecursiveEstimator:
         self.labels = everyone if errors else tuple(kinds.index(kind) for kind in kinds)
         self.pasts = Pasts(self.symmetric, kinds if errors else None)
         self.errors = errors
+        self.magnified = 1.0
         self._neighbours: dict[tuple[int, int], tuple[int, ...]] = {}
 
     @cached_property
@@ -163,8 +167,18 @@ class RecursiveEstimator:
         """Time update and the agent's own measurement."""
         H, R = at_step(self.world.H[agent], step), at_step(self.world.R[agent], step)
         z = None if self.footprints is None else self.footprints.measured(step, agent)
-        x, P = update(self.prior(step, agent, before), H, R, z)
+        prior = self.prior(step, agent, before)
+        x, P = update(prior, H, R, z)
+        self.grown(prior.P, P)
         return Worked(P, x, P @ (H.T @ np.linalg.solve(R, H)) @ P)
+
+    def grown(self, prior: np.ndarray, posterior: np.ndarray) -> None:
+        """Remember by how much the rounding of a prior covariance grew beside a posterior one."""
+        if prior.shape[-1] == 1:
+            return  # one state loses nothing
+        before, after = (np.diagonal(P, axis1=-2, axis2=-1) for P in (prior, posterior))
+        ratio = np.divide(before, np.abs(after), out=np.ones_like(before), where=after != 0)
+        self.magnified = max(self.magnified, float(ratio.max(initial=1.0)))
 
 
 class PastExchange:
@@ -234,13 +248,11 @@ class PastClaims:
                 self._settle([b for b, s in enumerate(steps) if s == step - 2])
             steps.append(step)
             rests_on = np.array([estimator.pasts.rests_on[n] for n in numbers], dtype=int).reshape(len(numbers), -1)
-            worked = estimator.batch(step, rules, [self._gathered(column) for column in rests_on.T])
-            if not np.isfinite(worked.P).all():
-                raise UsageError(f"step {step}: the covariance of {rules[0][0]} grows beyond floating point")
+            worked = _worked_out(estimator, step, rules, [self._gathered(column) for column in rests_on.T])
             self._batch[numbers], self._row[numbers] = len(self._worked), np.arange(len(numbers))
             self._worked.append(worked)
         self._settle([b for b, s in enumerate(steps) if s >= steps[-1] - 1])
-        self.width = self._worked[-1].P[0].size
+        self.width, self._magnified = self._worked[-1].P[0].size, estimator.magnified
 
     def estimate(self, terms: Sequence[tuple[int, np.ndarray]], step: int) -> tuple[Estimate | Moments, float]:
         """Estimates of a step, with the moments of their errors if these were carried along; nothing is summed."""
@@ -250,7 +262,7 @@ class PastClaims:
         moments = Moments(found.P) if found.actual is None else Moments.of(found.P, found.actual, found.bias)
         if not np.array_equal(used, values):
             moments = moments.map(lambda m: m[index])
-        return (Estimate(None, moments.P) if found.actual is None else moments), 1.0
+        return (Estimate(None, moments.P) if found.actual is None else moments), self._magnified
 
     def _settle(self, batches: Sequence[int]) -> None:
         """Keep of batches that nothing more rests on what may be claimed: footprints are large."""
@@ -274,3 +286,18 @@ class PastClaims:
             here = self._batch[numbers] == batch
             out[here] = part[self._row[numbers[here]]]
         return out
+
+
+def _worked_out(estimator: RecursiveEstimator, step: int, rules: Sequence[Rule], rests_on: list[Worked]) -> Worked:
+    """Work a batch out, and see that covariances come of it."""
+    mend = "expected noises R that are not negligible beside the errors P, in units in which P is not far from 1"
+    try:
+        worked = estimator.batch(step, rules, rests_on)
+    except np.linalg.LinAlgError:
+        raise UsageError(f"step {step}: the covariance of an innovation is singular: {mend}") from None
+    variances = np.diagonal(worked.P, axis1=-2, axis2=-1)
+    if not np.isfinite(worked.P).all():
+        raise UsageError(f"step {step}: the covariance of an estimate grows beyond floating point")
+    if (variances < 0).any() or estimator.magnified > MOST_MAGNIFIED:
+        raise UsageError(f"step {step}: rounding has the size of the covariance of an estimate: {mend}")
+    return worked

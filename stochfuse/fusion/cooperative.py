@@ -40,6 +40,8 @@ COINCIDENT = 1e-9
 """Distance, in units of the nodes' distance from the origin, at which rounding leaves nothing of the direction."""
 NEGLIGIBLE = 1e-12
 """Share of the variances that went into an innovation's variance at which it is taken for rounding of zero."""
+ROUNDING = 4e-15
+"""The same where R is not singular but less than the rounding of H P Hᵀ: only what is rounding itself is left out."""
 
 
 class Relation(NamedTuple):
@@ -250,24 +252,35 @@ def itns_update(joint: Estimate, H: np.ndarray, R: np.ndarray, z: Any = None) ->
 def _update(estimate: Estimate, H: np.ndarray, R: np.ndarray, z: Any) -> Estimate:
     """The kernel's update, with the pseudo-inverse of the innovation covariance where R leaves that singular."""
     if not _definite(R):
-        H, R, z = _without_certainties(estimate.P, H, R, z)
+        H, R, z = _without_certainties(estimate.P, H, R, z, NEGLIGIBLE)
+    elif _drowned(estimate.P, H, R):
+        H, R, z = _without_certainties(estimate.P, H, R, z, ROUNDING)
     return update(estimate, H, R, z)
 
 
-def _without_certainties(P: np.ndarray, H: np.ndarray, R: np.ndarray, z: Any) -> tuple[np.ndarray, np.ndarray, Any]:
+def _without_certainties(
+    P: np.ndarray, H: np.ndarray, R: np.ndarray, z: Any, negligible: float
+) -> tuple[np.ndarray, np.ndarray, Any]:
     """Return the measurement (H, R, z) without the directions in which the innovation has no variance.
 
     They stay as rows of zeros with noise 1, so that stacks keep their shape; the kernel's gain is then P Hᵀ S⁺.
     """
-    deviations = np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))[..., None]
+    deviations = np.sqrt(np.maximum(np.diagonal(P, axis1=-2, axis2=-1), 0.0))[..., None]
     # H P Hᵀ is known to rounding of what it is a difference of: the scale of what counts as zero
     size = (np.abs(H) @ deviations) ** 2 + np.diagonal(R, axis1=-2, axis2=-1)[..., None]
     scale = 1.0 / np.sqrt(np.where(size > 0, size, 1.0))
     H, R = scale * H, scale * R * np.swapaxes(scale, -1, -2)
     values, vectors = np.linalg.eigh(H @ P @ np.swapaxes(H, -1, -2) + R)
-    certain = (vectors * (values <= NEGLIGIBLE)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    certain = (vectors * (values <= negligible)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     keep = np.eye(H.shape[-2]) - certain
     return keep @ H, keep @ R @ keep + certain, None if z is None else keep @ (scale * z)
+
+
+def _drowned(P: np.ndarray, H: np.ndarray, R: np.ndarray) -> bool:
+    """Whether some noise is no more than the rounding of what H P Hᵀ is a difference of."""
+    deviations = np.sqrt(np.maximum(np.diagonal(P, axis1=-2, axis2=-1), 0.0))[..., None]
+    size = ((np.abs(H) @ deviations) ** 2)[..., 0]
+    return bool((np.diagonal(R, axis1=-2, axis2=-1) <= ROUNDING * size).any())
 
 
 def _definite(R: np.ndarray) -> bool:
