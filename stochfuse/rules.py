@@ -3,6 +3,13 @@
 local-fusion-graph        common information removed by the graph (thesis chapter 2)
 naive                     estimates added up, nothing removed, (42)/(43)
 optimal                   the best that any linear fusion could do with what arrived (theory section 6)
+covariance-intersection   everything taken for possibly correlated (theory section 9, as all that follow)
+split-ci                  everything but the step's own measurement
+blender, joint-blender    parallel filters, in a tree or all at once
+equivalent-measurement    measurements exchanged, their noises correlated and uncertain
+independent-measurements  the same as if they were independent
+lwin, itns                cooperative measurements, local or central
+stand-alone               no fusion
 """
 
 from __future__ import annotations
