@@ -172,7 +172,13 @@ def fuse_stack(
     return _fuse(first, second, maps, checked_criterion(criterion or Criterion(), d or 0), None)[0]
 
 
-def _fuse(A1, A2, H, criterion: Criterion, given: np.ndarray | None) -> tuple[Stack, np.ndarray]:
+def _fuse(
+    A1: Sequence[np.ndarray],
+    A2: Sequence[np.ndarray],
+    H: Sequence[np.ndarray | None],
+    criterion: Criterion,
+    given: np.ndarray | None,
+) -> tuple[Stack, np.ndarray]:
     """The stack and the independent part C_2 (N, d, d) of its C."""
     plain = all(M is None for M in H) and not any(part.any() for part in A2)
     if len(A1) == 2 and plain and criterion.block is None and criterion.name in ("det", "trace"):
@@ -206,7 +212,9 @@ def _fuse_pairs(pairs: Pairs, name: str, given: np.ndarray | None) -> Stack:
     return Stack(np.stack([w, 1.0 - w], axis=-1), C, gains, excess(pairs, name, w))
 
 
-def _directions(A1, A2, H) -> tuple[Directions, list[np.ndarray]]:
+def _directions(
+    A1: Sequence[np.ndarray], A2: Sequence[np.ndarray], H: Sequence[np.ndarray | None]
+) -> tuple[Directions, list[np.ndarray]]:
     """Directions of information, and for each signal the S (N, p, p) with (A1/ω + A2)⁻¹ = S diag(g(ω)) Sᵀ."""
     N, p = len(A1[0]), max(A.shape[-1] for A in A1)
     d = A1[0].shape[-1] if H[0] is None else np.shape(H[0])[-1]
