@@ -32,13 +32,14 @@ from stochfuse.kalman import (
     update_information,
 )
 from stochfuse.model import Model, Sensor, at_step
+from stochfuse.renaming import Renamed
 
 START, MEASURED, PRIOR = "start", "measured", "prior"
 COMMON = -1
 """Source of an initial estimate that all agents share."""
 
 
-class Ledger:
+class Ledger(Renamed):
     """Numbers for distinct information sums; equal sums have equal numbers.
 
     A value is a sum of atoms at one step.  Sources (of start and measurement atoms) are numbers that the caller gives:
@@ -57,10 +58,7 @@ class Ledger:
         self._value_of: dict[tuple[int, tuple[tuple[int, int], ...]], int] = {}
         self._prior_of: dict[int, int] = {}
         self._local_of: dict[tuple[int, int], int] = {}
-        self._kinds = kinds
-        self._by_kind = None if kinds is None else Ledger()
-        self._kind_of: dict[int, int] = {}
-        self._moved: dict[tuple[int, ...], dict[int, int]] = {}
+        super().__init__(kinds, None if kinds is None else Ledger())
 
     def start(self, source: int) -> int:
         """Information of an initial estimate, at step 1."""
@@ -100,21 +98,6 @@ class Ledger:
             for atom, times in sums[value if steps[value] == step else self.forward(value, step)]:
                 total[atom] = total.get(atom, 0) + coefficient * times
         return self._value(step, tuple(sorted([pair for pair in total.items() if pair[1]])))
-
-    def invariant(self, value: int) -> int:
-        """Return a number that stays the same when agents of one kind change places."""
-        if self._by_kind is None or self._kinds is None:
-            return value
-        return self._renamed(value, self._by_kind, self._kinds, self._kind_of)
-
-    def moved(self, value: int, order: tuple[int, ...]) -> int:
-        """Return the value after agents changed places: place p is taken by agent order[p]."""
-        if self._kinds is None:
-            return value
-        place = [0] * len(order)
-        for p, agent in enumerate(order):
-            place[agent] = p
-        return self._renamed(value, self, place, self._moved.setdefault(order, {}))
 
     def _renamed(self, value: int, into: Ledger, names: Sequence[int], known: dict[int, int]) -> int:
         new = known.get(value)

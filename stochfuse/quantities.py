@@ -50,6 +50,12 @@ class Moments(NamedTuple):
         """Return the moments of one outcome."""
         return cls(P, actual, bias, actual + bias @ np.swapaxes(bias, -1, -2))
 
+    @classmethod
+    def of_footprint(cls, P: Any, x: Any) -> Moments:
+        """Return the moments from noise footprints x, (..., d, columns), whose last column is the bias."""
+        noises, bias = x[..., :-1], x[..., -1:]
+        return cls.of(P, noises @ np.swapaxes(noises, -1, -2), bias)
+
     def map(self, function: Any) -> Moments:
         """Return what a function makes of every moment there is."""
         return Moments(*(None if m is None else function(m) for m in self))

@@ -324,23 +324,7 @@ def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> S
     if network is not None and len(sensor_of) == network.agents:
         noise, process = read_noise(check, tables["noise"], [sensors[s] for s in sensor_of], filters, own)
     relations = _relations(check, mapping, model, network, own)
-    method = check.choice("report.method", tables["report"].get("method"), METHODS)
-    estimator = check.choice("report.estimator", tables["report"].get("estimator"), ESTIMATORS)
-    if estimator is not None and method not in (None, "general", "monte-carlo"):
-        check.note("report.estimator", 'report.method "general" or "monte-carlo", which average it', f'"{method}"')
-    runs = check.integer("report.runs", tables["report"].get("runs"), 2)
-    if method is None and (estimator is not None or runs is not None):
-        method = "general" if runs is None else "monte-carlo"
-    agent = check.integer("report.agent", tables["report"].get("agent"), 1)
-    if agent is not None and network is not None and agent > network.agents:
-        check.note("report.agent", f"an agent from 1 to {network.agents}", str(agent))
-    report = mapping.get("report")
-    metric = report.get("metric") if isinstance(report, dict) else None
-    if isinstance(metric, str) and model is not None:
-        try:
-            metric_of(metric, model)
-        except UsageError as reason:
-            check.note("report.metric", "a metric of this model", f"'{metric}' ({reason})")
+    shown = _report(check, tables["report"], model, network)
     problems = [*structure, *check.problems]
     if problems:
         raise ScenarioError(name, problems)
@@ -356,18 +340,35 @@ def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> S
         x0=np.zeros((model.dimension, 1)) if x0 is None else x0,
         error=error,
         network=network,
-        metric=metric,
         source={key: value for key, value in mapping.items() if key != "schema"},
         own=own,
         filters=filters,
         noise=noise,
         process=process,
         relations=relations,
-        agent=agent,
-        method=method,
-        estimator=estimator,
-        runs=runs,
+        **shown,
     )
+
+
+def _report(check: Checker, table: Mapping[str, Any], model: Model | None, network: Network | None) -> dict[str, Any]:
+    """How the scenario asks to be predicted and shown: metric, agent, method, estimator and runs."""
+    metric = table.get("metric")
+    if isinstance(metric, str) and model is not None:
+        try:
+            metric_of(metric, model)
+        except UsageError as reason:
+            check.note("report.metric", "a metric of this model", f"'{metric}' ({reason})")
+    method = check.choice("report.method", table.get("method"), METHODS)
+    estimator = check.choice("report.estimator", table.get("estimator"), ESTIMATORS)
+    if estimator is not None and method not in (None, "general", "monte-carlo"):
+        check.note("report.estimator", 'report.method "general" or "monte-carlo", which average it', f'"{method}"')
+    runs = check.integer("report.runs", table.get("runs"), 2)
+    if method is None and (estimator is not None or runs is not None):
+        method = "general" if runs is None else "monte-carlo"
+    agent = check.integer("report.agent", table.get("agent"), 1)
+    if agent is not None and network is not None and agent > network.agents:
+        check.note("report.agent", f"an agent from 1 to {network.agents}", str(agent))
+    return {"metric": metric, "agent": agent, "method": method, "estimator": estimator, "runs": runs}
 
 
 def _navigation(

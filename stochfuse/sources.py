@@ -118,8 +118,7 @@ def moments(estimate: Estimate | Moments) -> Moments:
     """Moments of the error from an estimate whose state is a noise footprint, x of shape (..., d, columns)."""
     if isinstance(estimate, Moments):
         return estimate
-    noises, bias = estimate.x[..., :-1], estimate.x[..., -1:]
-    return Moments.of(estimate.P, noises @ np.swapaxes(noises, -1, -2), bias)
+    return Moments.of_footprint(estimate.P, estimate.x)
 
 
 def claimed_only(estimate: Estimate | Moments) -> Moments:

@@ -42,7 +42,7 @@ class World:
     own : whether every agent has a state of its own.
     relations : what agent i measures of agent j, (i, j) → anything with H_i, H_j, R, constant or per step; empty where
         all track one state.
-    M, s : shaping x = M_i x_i + s_i of each agent's state into the full one; None where it is the identity.
+    M : shaping x = M_i x_i + s_i of each agent's state into the full one; None where it is the identity.
     """
 
     steps: int
@@ -104,6 +104,14 @@ class World:
         out[:, self.states[agent]] = H
         return out
 
+    def between(self, step: int, pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What an agent measures of another, H_i, H_j and R; where all track one state agreement, x_i − x_j = 0."""
+        if self.own:
+            H_i, H_j, R = (at_step(M, step) for M in self.relations[pair])
+            return H_i, H_j, R
+        same = np.eye(self.states[0].stop)
+        return same, -same, 0.0 * same
+
 
 class Footprints:
     """Noise footprints of a world: columns of unit noises, and a last one for the known initial error."""
@@ -144,7 +152,9 @@ class Footprints:
         return self._placed(self._noise[step][self._world.measurements[agent]], self._first["noise", step])
 
     def related(self, step: int, pair: tuple[int, int]) -> np.ndarray:
-        """Noise of what one agent measures of another."""
+        """Noise of what one agent measures of another; agreement has none."""
+        if not self._world.own:
+            return np.zeros((self._world.states[0].stop, self.columns))
         return self._placed(self._relation[(step, *pair)], self._first["relation", (step, *pair)])
 
     def _placed(self, block: np.ndarray, first: int) -> np.ndarray:

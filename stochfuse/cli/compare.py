@@ -15,7 +15,6 @@ from stochfuse.cli.options import (
     ArchitectureOption,
     CriterionOption,
     DigitsOption,
-    Estimator,
     Format,
     FormatOption,
     LinkOption,
@@ -120,7 +119,7 @@ def compare(
         raise UsageError(f"--methods: expected one with several estimators, got {methods}")
     settings = settings_for(
         ["general", "monte-carlo"] if several and methods is None else ways,
-        estimator=None if several or names is None else Estimator(_known(names[0])),
+        estimator=None if several or names is None else _known(names[0]),
         max_graphs=max_graphs,
         prune=prune,
         runs=runs,

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from stochfuse.information import Ledger
+from stochfuse.renaming import Renamed
 
 
 class Late(NamedTuple):
@@ -149,6 +150,40 @@ class FusionRule:
     ) -> None:
         self.ledger, self.sources, self.shared = ledger, tuple(sources), shared
         self.relabellings = relabellings or [tuple(range(len(self.sources)))]
+
+
+def in_least_order(
+    book: Renamed,
+    agents: Sequence[int],
+    late: Sequence[tuple[int, int, int]],
+    relabellings: Sequence[tuple[int, ...]],
+) -> tuple[tuple[int, ...], tuple[tuple[int, int, int], ...], tuple[int, ...]]:
+    """Put agents and messages under way into the order that like states share.
+
+    Parameters
+    ----------
+    book : where the values are written.
+    agents : value of every agent.
+    late : (receiver, steps left, value) of messages under way.
+    relabellings : as for `best_relabelling`.
+
+    Returns
+    -------
+    agents, late, order
+        Renamed, and the agent that took each place.
+    """
+    if len(relabellings) == 1:
+        return tuple(agents), tuple(sorted(late)), relabellings[0]
+    invariants = [
+        (book.invariant(value), sorted((left, book.invariant(v)) for r, left, v in late if r == i))
+        for i, value in enumerate(agents)
+    ]
+    found = []
+    for order in best_relabelling(invariants, relabellings):
+        place = {i: p for p, i in enumerate(order)}
+        late_now = tuple(sorted((place[r], left, book.moved(value, order)) for r, left, value in late))
+        found.append((tuple(book.moved(agents[i], order) for i in order), late_now, order))
+    return min(found)
 
 
 def best_relabelling(invariants: Sequence[Hashable], relabellings: Sequence[tuple[int, ...]]) -> list[tuple[int, ...]]:

@@ -43,17 +43,12 @@ class Lwin(RecursiveEstimator):
     def work(self, step: int, rules: Sequence[Rule], rests_on: list[Worked]) -> Worked:
         """One neighbour after the other."""
         own, *neighbours = (Estimate(each.x, each.P) for each in rests_on)
-        if rules[0][0] == AGREED:
-            same = np.eye(own.P.shape[-1])
-            for neighbour in neighbours:
-                z = None if own.x is None else np.zeros_like(own.x)
-                own = lwin_update(own, neighbour, same, -same, 0.0 * same, z)
-            return Worked(own.P, own.x)
-        _, agent, *others = rules[0]
-        for j, neighbour in zip(others, neighbours, strict=True):
-            z = None if self.footprints is None else self.footprints.related(step, (agent, j))
-            H_i, H_j, R = (at_step(M, step) for M in self.world.relations[agent, j])
-            own = lwin_update(own, neighbour, H_i, H_j, R, z)
+        _, *agents = rules[0]
+        # agreement is the same between any two
+        pairs = [(agents[0], j) for j in agents[1:]] if agents else [(0, 1)] * len(neighbours)
+        for pair, neighbour in zip(pairs, neighbours, strict=True):
+            z = None if self.footprints is None else self.footprints.related(step, pair)
+            own = lwin_update(own, neighbour, *self.world.between(step, pair), z)
         return Worked(own.P, own.x)
 
 
@@ -165,11 +160,7 @@ class Itns(RecursiveEstimator):
     def _between(self, step: int, pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         """What one agent measures of another, over the joint state, and its noise."""
         (i, j), states = pair, self.world.states
-        if self.world.own:
-            H_i, H_j, R = (at_step(M, step) for M in self.world.relations[pair])
-        else:
-            d = states[i].stop - states[i].start
-            H_i, H_j, R = np.eye(d), -np.eye(d), np.zeros((d, d))
+        H_i, H_j, R = self.world.between(step, pair)
         H = np.zeros((len(R), len(self.world.P0)))
         H[:, states[i]], H[:, states[j]] = H_i, H_j
         return H, R

@@ -25,7 +25,6 @@ from stochfuse.errors import UsageError
 from stochfuse.estimators.pasts import Rule
 from stochfuse.estimators.recursion import RecursiveEstimator, Worked
 from stochfuse.fusion.covariance_intersection import Criterion, Stack, fuse_stack
-from stochfuse.model import at_step
 from stochfuse.world import World
 
 TOGETHER, RELATED = "intersection", "related intersection"
@@ -95,8 +94,7 @@ class SplitCovarianceIntersection(RecursiveEstimator):
         maps: list[Any] = [None]
         signals = [None if rests_on[0].x is None else rests_on[0].x]
         for place, j in enumerate(others, start=1):
-            relation = self.world.relations[agent, j]
-            H_i, H_j, R = (at_step(M, step) for M in relation)
+            H_i, H_j, R = self.world.between(step, (agent, j))
             maps.append(H_i)
             known[place] = H_j @ known[place] @ H_j.T + (0.0 if self.split else R)
             independent[place] = H_j @ independent[place] @ H_j.T + (R if self.split else 0.0 * R)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from stochfuse.estimators import FusionRule, Late, best_relabelling
+from stochfuse.estimators import FusionRule, Late, in_least_order
 from stochfuse.information import COMMON
 
 
@@ -69,18 +69,9 @@ class NaiveExchange:
 
     def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[State, tuple[int, ...]]:
         """State before the next exchange, in the order that like states share, and the agent at each place of it."""
-        agents, under_way = self._next(heard, late)
-        ledger = self.estimator.ledger
-        invariants = [
-            (ledger.invariant(agents[i]), sorted((left, ledger.invariant(v)) for r, left, v in under_way if r == i))
-            for i in range(len(agents))
-        ]
-        states = []
-        for order in best_relabelling(invariants, self.estimator.relabellings):
-            place = {i: p for p, i in enumerate(order)}
-            late_now = tuple(sorted((place[r], left, ledger.moved(value, order)) for r, left, value in under_way))
-            states.append((State(tuple(ledger.moved(agents[i], order) for i in order), late_now), order))
-        return min(states)
+        estimator = self.estimator
+        agents, under_way, order = in_least_order(estimator.ledger, *self._next(heard, late), estimator.relabellings)
+        return State(agents, under_way), order
 
     def onward(self, heard: Sequence[int], late: Sequence[Late] = ()) -> NaiveExchange:
         """Open the next exchange as it comes."""

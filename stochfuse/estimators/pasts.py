@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from stochfuse.renaming import Renamed
+
 Rule = tuple[Any, ...]
 """Name of a rule, and the numbers of the agents that it concerns."""
 
 
-class Pasts:
+class Pasts(Renamed):
     """Numbers for distinct pasts; what a past rests on has smaller numbers.
 
     Parameters
@@ -26,10 +28,7 @@ class Pasts:
         self.rests_on: list[tuple[int, ...]] = []
         self._symmetric = frozenset(symmetric)
         self._number: dict[tuple[int, Rule, tuple[int, ...]], int] = {}
-        self._kinds = kinds
-        self._by_kind = None if kinds is None else Pasts(symmetric)
-        self._kind_of: dict[int, int] = {}
-        self._moved: dict[tuple[int, ...], dict[int, int]] = {}
+        super().__init__(kinds, None if kinds is None else Pasts(symmetric))
 
     def number(self, step: int, rule: Rule, rests_on: Sequence[int] = ()) -> int:
         """Return the number of a past."""
@@ -42,27 +41,12 @@ class Pasts:
             self.rests_on.append(key[2])
         return known
 
-    def invariant(self, number: int) -> int:
-        """Return a number that stays the same when agents of one kind change places."""
-        if self._by_kind is None or self._kinds is None:
-            return number
-        return self._renamed(number, self._by_kind, self._kinds, self._kind_of)
-
-    def moved(self, number: int, order: tuple[int, ...]) -> int:
-        """Return the number of the past after agents changed places: place p is taken by agent order[p]."""
-        if self._kinds is None:
-            return number
-        place = [0] * len(order)
-        for p, agent in enumerate(order):
-            place[agent] = p
-        return self._renamed(number, self, place, self._moved.setdefault(order, {}))
-
-    def _renamed(self, number: int, into: Pasts, names: Sequence[int], known: dict[int, int]) -> int:
-        new = known.get(number)
+    def _renamed(self, value: int, into: Pasts, names: Sequence[int], known: dict[int, int]) -> int:
+        new = known.get(value)
         if new is None:
-            name, *agents = self.rule[number]
-            rests_on = [self._renamed(n, into, names, known) for n in self.rests_on[number]]
-            new = known[number] = into.number(self.step[number], (name, *(names[a] for a in agents)), rests_on)
+            name, *agents = self.rule[value]
+            rests_on = [self._renamed(n, into, names, known) for n in self.rests_on[value]]
+            new = known[value] = into.number(self.step[value], (name, *(names[a] for a in agents)), rests_on)
         return new
 
     def batches(self, mixed: Sequence[str]) -> Iterator[tuple[int, list[Rule], np.ndarray]]:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.errors import UsageError
-from stochfuse.estimators import Late, Made, best_relabelling
+from stochfuse.estimators import Late, Made, in_least_order
 from stochfuse.estimators.pasts import Pasts, Rule
 from stochfuse.kalman import Estimate, predict, update
 from stochfuse.model import at_step
@@ -50,8 +50,8 @@ class Worked(NamedTuple):
         """Return the same with moments of the error in the place of the footprint, once nothing more rests on it."""
         if self.x is None:
             return Worked(self.P, actual=self.actual, bias=self.bias)
-        noises, bias = self.x[..., :-1], self.x[..., -1:]
-        return Worked(self.P, actual=noises @ np.swapaxes(noises, -1, -2), bias=bias)
+        moments = Moments.of_footprint(self.P, self.x)
+        return Worked(self.P, actual=moments.actual, bias=moments.bias)
 
 
 class State(NamedTuple):
@@ -203,20 +203,10 @@ class PastExchange:
 
     def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[State, tuple[int, ...]]:
         """State before the next exchange, in the order that like states share, and the agent at each place of it."""
-        step, agents, under_way = self._next(heard, late)
-        pasts, relabellings = self.estimator.pasts, self.estimator.relabellings
-        if len(relabellings) == 1:
-            return State(step, agents, under_way), relabellings[0]
-        invariants = [
-            (pasts.invariant(agents[i]), sorted((left, pasts.invariant(v)) for r, left, v in under_way if r == i))
-            for i in range(len(agents))
-        ]
-        states = []
-        for order in best_relabelling(invariants, relabellings):
-            place = {i: p for p, i in enumerate(order)}
-            late_now = tuple(sorted((place[r], left, pasts.moved(value, order)) for r, left, value in under_way))
-            states.append((State(step, tuple(pasts.moved(agents[i], order) for i in order), late_now), order))
-        return min(states)
+        estimator = self.estimator
+        step, agents, coming = self._next(heard, late)
+        agents, under_way, order = in_least_order(estimator.pasts, agents, coming, estimator.relabellings)
+        return State(step, agents, under_way), order
 
     def onward(self, heard: Sequence[int], late: Sequence[Late] = ()) -> PastExchange:
         """Open the next exchange as it comes."""
