@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from stochfuse.scenario import Scenario as Scenario
     from stochfuse.scenario import load_scenario as load_scenario
     from stochfuse.states import predict_states as predict_states
+    from stochfuse.studies.running import study as study
     from stochfuse.symbolic import derive_simplified as derive_simplified
     from stochfuse.symbolic_general import derive_general as derive_general
     from stochfuse.symbolic_optimal import derive_optimal as derive_optimal
@@ -77,6 +78,7 @@ _HOME = {
     "sensitivity": "inverse.sensitivity",
     "share_of_gain": "inverse.sensitivity",
     "steady_state": "questions",
+    "study": "studies.running",
 }
 
 __all__ = [
@@ -110,6 +112,7 @@ __all__ = [
     "sensitivity",
     "share_of_gain",
     "steady_state",
+    "study",
 ]
 
 

@@ -24,7 +24,10 @@ INDEFINITE = -1e-9
 
 def shown(value: Any) -> str:
     """Return a value as it came, cut to a readable length."""
-    text = repr(value)
+    try:
+        text = repr(value)
+    except (RecursionError, ValueError):
+        return "something too large to show"
     return text if len(text) <= 60 else text[:57] + "..."
 
 
@@ -194,7 +197,8 @@ class Checker:
             return None
         if isinstance(value, list | tuple | np.ndarray) and len(value):
             depths = [np.ndim(entry) if not isinstance(entry, list | tuple) else _depth(entry) for entry in value]
-            if set(depths) == {0, 2}:
+            fitting = all(len(entry) == agents for entry, depth in zip(value, depths, strict=True) if depth == 2)
+            if set(depths) == {0, 2} and fitting:
                 value = [
                     np.full((agents, agents), e).tolist() if depth == 0 else e
                     for e, depth in zip(value, depths, strict=True)

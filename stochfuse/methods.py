@@ -225,7 +225,7 @@ def _enumerated(scenario: Scenario, rows: LinkRows, how: Settings, estimator: st
     return {
         "nature": "exact" if left_out <= 1e-12 else "approximate",
         "moments": moments,
-        "group_of": _group_of(found.groups),
+        "group_of": group_of(found.groups),
         "estimator": estimator,
         "notes": tuple(notes),
         "outcomes": found,
@@ -254,7 +254,7 @@ def _optimal(scenario: Scenario, rows: LinkRows, errors: bool) -> dict[str, Any]
     return {
         "nature": "bound" if bound else "exact",
         "moments": moments,
-        "group_of": _group_of(groups),
+        "group_of": group_of(groups),
         "estimator": "optimal",
         "notes": tuple(notes),
         "meta": {"paths": found.paths, "relative_bound": found.bound.tolist()},
@@ -279,14 +279,15 @@ def _sampled(scenario: Scenario, rows: LinkRows, how: Settings, errors: bool) ->
         "nature": "sampled",
         "notes": (),
         "moments": found.moments(),
-        "group_of": _group_of(found.groups),
+        "group_of": group_of(found.groups),
         "estimator": how.estimator,
         "sampled": found,
         "meta": {"runs": how.runs, "seed": how.seed},
     }
 
 
-def _group_of(groups: Sequence[tuple[int, ...]]) -> np.ndarray:
+def group_of(groups: Sequence[tuple[int, ...]]) -> np.ndarray:
+    """Index of every agent among groups of agents."""
     index = np.zeros(sum(map(len, groups)), dtype=int)
     for group, agents in enumerate(groups):
         index[list(agents)] = group

@@ -11,6 +11,7 @@ prediction or measurement (see `stochfuse.scenario`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -68,6 +69,25 @@ class Noise:
 
     correlation: np.ndarray
     disturbance: np.ndarray | None = None
+
+
+class Noises(NamedTuple):
+    """Noises of a batch of scenarios that have everything else in common; None where the scenario's own are meant.
+
+    Parameters
+    ----------
+    Q : (items, d, d) process noise as it enters the state.
+    R : (items, p, p) measurement noise of every agent's sensor, positive definite.
+    P0 : (items, d, d) covariance of the first estimates.
+    """
+
+    Q: np.ndarray | None = None
+    R: np.ndarray | None = None
+    P0: np.ndarray | None = None
+
+    def take(self, items: np.ndarray | slice) -> Noises:
+        """Return the noises of some of the items."""
+        return Noises(*(None if M is None else M[items] for M in self))
 
 
 @dataclass(frozen=True, eq=False)

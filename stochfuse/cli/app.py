@@ -13,7 +13,18 @@ from typer.core import TyperGroup
 from stochfuse import __version__
 from stochfuse.errors import NoAnswerError, ScenarioError, StochfuseError, UsageError
 
-COMMANDS = ("predict", "compare", "solve", "messages", "derive", "graph", "crosscheck", "reproduce", "scenario")
+COMMANDS = (
+    "predict",
+    "compare",
+    "solve",
+    "messages",
+    "derive",
+    "graph",
+    "crosscheck",
+    "reproduce",
+    "study",
+    "scenario",
+)
 """Each has a module in `stochfuse.cli`, with a function of the same name, or with an `app` of its own commands."""
 
 EXIT_FAILURE, EXIT_USAGE, EXIT_NO_ANSWER, EXIT_INTERRUPTED = 1, 2, 3, 130

@@ -76,12 +76,17 @@ def check(scenario: ScenarioArgument) -> None:
 
 
 @app.command()
-def schema(output: OutputOption = None) -> None:
+def schema(
+    study: Annotated[bool, typer.Option("--study", help="Of a study file, see `stochfuse study`.")] = False,
+    output: OutputOption = None,
+) -> None:
     """Print the JSON Schema of a scenario file."""
     from stochfuse.report.export import to_json, write_text
+    from stochfuse.studies.schema import StudyFile
     from stochfuse.tables.schema import ScenarioFile
 
-    write_text(to_json(ScenarioFile.model_json_schema(by_alias=True)), output)
+    structure = StudyFile if study else ScenarioFile
+    write_text(to_json(structure.model_json_schema(by_alias=True)), output)
 
 
 @app.command()

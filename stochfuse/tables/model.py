@@ -11,6 +11,9 @@ from stochfuse.checks import Checker, shown
 from stochfuse.model import Filter, Model, Sensor
 from stochfuse.network import ARCHITECTURES, Network, mean_delivery
 
+MOST_DELAY = 10_000
+"""Largest delay of a message, in steps."""
+
 
 def read_network(check: Checker, table: Mapping[str, Any]) -> Network | None:
     """Read [network]; None where something essential is wrong, which the checker has noted."""
@@ -61,6 +64,7 @@ def _hears(check: Checker, value: Any, agents: int, architecture: str) -> np.nda
         return None
     hears = np.zeros((agents, agents), dtype=bool)
     for i, others in enumerate(value):
+        others = others if isinstance(others, list) else []
         known = [j for j in others if isinstance(j, int) and 1 <= j <= agents and j != i + 1]
         if len(set(known)) < len(others):
             check.note(f"network.hears[{i + 1}]", f"other agents from 1 to {agents}, each once", shown(others))
@@ -123,6 +127,9 @@ def _delay(check: Checker, value: Any) -> tuple[float, ...]:
                 "network.delay", "a whole number of steps, or the probabilities of 0, 1, 2 … steps", shown(value)
             )
             return (1.0,)
+        if array > MOST_DELAY:
+            check.note("network.delay", f"at most {MOST_DELAY} steps", shown(value))
+            return (1.0,)
         return (0.0,) * int(array) + (1.0,)
     if array.ndim != 1 or not array.size or (array < 0).any() or abs(array.sum() - 1) > 1e-9:
         check.note("network.delay", "probabilities of 0, 1, 2 … steps that sum to 1", shown(value))
@@ -160,7 +167,7 @@ def read_model(check: Checker, table: Mapping[str, Any], steps: int) -> tuple[Mo
 
 
 def _names(check: Checker, path: str, value: Any, d: int | None) -> tuple[str, ...] | None:
-    if not isinstance(value, list) or d is None:
+    if not isinstance(value, list) or d is None or not all(isinstance(name, str) for name in value):
         return None
     if len(value) != d:
         check.note(path, f"{d} names, one per state", f"{len(value)}")

@@ -181,11 +181,18 @@ _SHAPE_OF = {
 
 def structure_problems(mapping: Any) -> list[Problem]:
     """Return every key of a parsed file that is unknown, missing or of the wrong kind, once each."""
-    problems = {}
+    problems = []
     if isinstance(mapping, dict) and "navigation" not in mapping:
-        problems = {key: Problem(key, "a value", "nothing") for key in ("model", "initial") if key not in mapping}
+        problems = [Problem(key, "a value", "nothing") for key in ("model", "initial") if key not in mapping]
+    known = {problem.path for problem in problems}
+    return problems + [problem for problem in problems_of(ScenarioFile, mapping) if problem.path not in known]
+
+
+def problems_of(structure: type[Table], mapping: Any) -> list[Problem]:
+    """Return every key of a parsed file that does not fit a structure, once each."""
+    problems: dict[str, Problem] = {}
     try:
-        ScenarioFile.model_validate(mapping)
+        structure.model_validate(mapping)
     except ValidationError as error:
         for entry in error.errors(include_url=False, include_context=True):
             problem = _problem(entry)

@@ -16,7 +16,7 @@ from rich.table import Table
 
 import stochfuse as sf
 from tests import textbook
-from tests.benchmarks import chain, intersection, literal
+from tests.benchmarks import chain, growth, intersection, literal, studies
 from tests.strategies import mapping
 from tests.test_accuracy import CASES
 
@@ -134,7 +134,9 @@ def show(title: str, headings: tuple[str, ...], rows: list[tuple[str, ...]]) -> 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="one round each: only that they run")
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the contact chain's cost against n and k")
+    parser.add_argument(
+        "--plot", type=Path, metavar="FILE", help="draw cost against agents, steps, states and points (two files)"
+    )
     given = parser.parse_args()
     quick = given.quick
     rounds = 1 if quick else 7
@@ -173,10 +175,16 @@ def main() -> None:
     show(
         "Contact chain, one µ: cost against n and k",
         ("", "first", "last", "slope of the upper half"),
-        chain.slopes(grown),
+        growth.slopes(grown),
     )
     if given.plot:
         chain.plot(grown, given.plot)
+    show("Studies, in processes of their own", studies.HEADINGS, studies.promised(quick))
+    costs = studies.growth(quick)
+    for title, found in costs.items():
+        show(f"{title}: cost", ("", "first", "last", "slope of the upper half"), growth.slopes(found))
+    if given.plot:
+        studies.plot(costs, given.plot.with_stem(given.plot.stem + "-studies"))
     show(
         "Start-up, wall time", ("command", "bare app", "stochfuse", "ratio", "bound", ""), start_up(1 if quick else 21)
     )

@@ -2,25 +2,14 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import numpy as np
 
 import stochfuse as sf
+from tests.benchmarks.growth import draw, seconds
 
 LINK = np.linspace(0, 1, 1001)
-
-
-def seconds(function, rounds: int) -> float:
-    """Least time of some rounds, after one that is not counted."""
-    function()
-    times = []
-    for _ in range(rounds):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return min(times)
 
 
 def promised(quick: bool) -> list[tuple[str, ...]]:
@@ -74,29 +63,11 @@ def growth(quick: bool) -> dict[str, tuple[list[int], list[float]]]:
     }
 
 
-def slopes(found: dict[str, tuple[list[int], list[float]]]) -> list[tuple[str, ...]]:
-    """Name, first and last time, and the slope of the upper half in a doubly logarithmic plot."""
-    rows = []
-    for name, (sizes, times) in found.items():
-        upper = slice(len(sizes) // 2, None) if len(sizes) > 2 else slice(None)
-        slope = np.polyfit(np.log(sizes[upper]), np.log(times[upper]), 1)[0]
-        rows.append(
-            (name, f"{sizes[0]}: {times[0] * 1e3:.3g} ms", f"{sizes[-1]}: {times[-1] * 1e3:.3g} ms", f"{slope:.1f}")
-        )
-    return rows
-
-
 def plot(found: dict[str, tuple[list[int], list[float]]], output: Path) -> None:
     """Draw the growth of the cost."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4.5), layout="constrained")
-    axes = figure.add_subplot()
-    for (name, (sizes, times)), style in zip(found.items(), ("o-", "s-", "o--", "s--"), strict=True):
-        axes.loglog(sizes, times, style, label=name)
-    axes.set_xlabel("agents n, or steps k")
-    axes.set_ylabel("time for one µ [s]")
-    axes.set_title("Contact chain, scalar: exact up to 20,000 paths, enclosed beyond")
-    axes.grid(alpha=0.3, which="both")
-    axes.legend()
-    figure.savefig(output, dpi=150)
+    draw(
+        {"Contact chain, scalar: exact up to 20,000 paths, enclosed beyond": found},
+        output,
+        "agents n, or steps k",
+        "time for one µ [s]",
+    )

@@ -1,0 +1,259 @@
+"""`stochfuse study`: one question asked of many points, as a file, a Pareto front or a plot."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from stochfuse.cli.options import DigitsOption, Format, FormatOption, write_report
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from stochfuse.studies.results import Results
+
+EVERY = 30.0
+"""Seconds between lines of progress where there is no terminal for a bar."""
+PATIENCE = 10
+"""Seconds in which a scheduler should answer."""
+
+
+class Kind(StrEnum):
+    """Plots over two keys."""
+
+    heat = "heat"
+    contour = "contour"
+
+
+def study(
+    study: Annotated[str, typer.Argument(metavar="STUDY", help="TOML or JSON file, - for standard input.")],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE",
+            help="The result, .parquet or .csv; default: beside the study file, .parquet.",
+        ),
+    ] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    dask: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Work on the cluster of this Dask scheduler, tcp://host:8786."),
+    ] = None,
+    restart: Annotated[bool, typer.Option("--restart", help="Begin anew, and replace a result that is there.")] = False,
+    pareto: Annotated[
+        bool, typer.Option("--pareto", help="Show the points that no other beats in both accuracy and message load.")
+    ] = False,
+    column: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Value column to show: claimed.trace; default: the first."),
+    ] = None,
+    step: Annotated[int | None, typer.Option(min=1, help="Step to show; default: the last.")] = None,
+    plot: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Draw the front, or the column over two keys: .png, .svg or .pdf."),
+    ] = None,
+    over: Annotated[
+        str | None, typer.Option(metavar="KEY,KEY", help="Keys that the plot is drawn over; default: the first two.")
+    ] = None,
+    where: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KEY=VALUE", help="Value of a key that the plot is not drawn over; may be repeated."),
+    ] = None,
+    kind: Annotated[Kind, typer.Option(help="What is drawn over two keys.")] = Kind.heat,
+    digits: DigitsOption = 5,
+    format: FormatOption = None,
+) -> None:
+    """Predict many points: a grid, a list or a Latin hypercube over scenario keys and methods.
+
+    The result has one row per point and step. Killed at any moment, the same command goes on where it stopped; when it
+    is finished, it shows what there is. Example: stochfuse study trade.toml --workers 2 --plot trade.png
+    """
+    from stochfuse.cli.options import check_files
+    from stochfuse.errors import UsageError
+    from stochfuse.studies.running import result_path
+    from stochfuse.studies.running import study as run
+
+    check_files(output, plot, study)
+    for option, given in (("--over", over is not None), ("--where", bool(where))):
+        if given and (plot is None or pareto):
+            raise UsageError(f"{option}: expected --plot without --pareto")
+    if dask is not None and workers != 1:
+        raise UsageError("--workers: expected nothing with --dask, whose cluster has its own")
+    with _executor(dask, workers) as (executor, width), _shown() as progress:
+        target = result_path(study, output)
+        try:
+            results = run(study, target, workers=width, executor=executor, restart=restart, progress=progress)
+        except BaseException as error:
+            progress.stop()
+            if isinstance(error, KeyboardInterrupt):
+                typer.echo("note: finished points are kept: the same command goes on", err=True)
+            if restart:
+                typer.echo("note: --restart begins anew; to go on, leave it out", err=True)
+            raise
+    _tell(results)
+    if pareto:
+        _pareto(results, column, step, plot, digits, format)
+        return
+    if plot is not None:
+        from stochfuse.report.study_plots import plot_over
+
+        keys = None if over is None else tuple(key.strip() for key in over.split(","))
+        plot_over(results, keys, column, kind.value, _pairs(where or []), step, plot)
+    from stochfuse.report import studies
+
+    write_report(
+        format,
+        None,
+        partial(studies.summary_table, results, digits),
+        partial(studies.summary_csv, results),
+        partial(studies.summary_json, results),
+    )
+
+
+def _pareto(
+    results: Results, column: str | None, step: int | None, plot: Path | None, digits: int, format: Format | None
+) -> None:
+    from stochfuse.report import studies
+    from stochfuse.studies.pareto import pareto
+
+    front = pareto(results, column, step)
+    for note in front.notes:
+        typer.echo(f"note: {note}", err=True)
+    if plot is not None:
+        from stochfuse.report.study_plots import plot_pareto
+
+        plot_pareto(front, results, plot)
+    write_report(
+        format,
+        None,
+        partial(studies.pareto_table, front, results, digits),
+        partial(studies.pareto_csv, front, results),
+        partial(studies.pareto_json, front, results),
+    )
+
+
+def _tell(results: Results) -> None:
+    if results.failed:
+        point, reason = results.first_errors[0]
+        typer.echo(
+            f"warning: {results.failed} of {results.plan.size} points failed; the first, point {point}: {reason}",
+            err=True,
+        )
+
+
+def _pairs(texts: list[str]) -> dict[str, str]:
+    from stochfuse.errors import UsageError
+
+    found = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise UsageError(f"--where: expected KEY=VALUE, got '{text}'")
+        found[key.strip()] = value.strip()
+    return found
+
+
+@contextmanager
+def _executor(address: str | None, workers: int) -> Iterator[tuple[Executor | None, int]]:
+    """Connect to a cluster, if one is asked for."""
+    if address is None:
+        yield None, workers
+        return
+    from stochfuse.errors import UsageError
+
+    try:
+        from distributed import Client
+    except ImportError:
+        raise UsageError("--dask needs dask.distributed: pip install 'stochfuse[scale]'") from None
+    try:
+        client: Any = Client(address, timeout=PATIENCE)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"--dask {address}: expected a Dask scheduler that answers, got {error}") from None
+    with client:
+        width = sum(client.nthreads().values())
+        if not width:
+            raise UsageError(f"--dask {address}: expected a cluster with workers, got none (dask worker {address})")
+        yield client.get_executor(), width
+
+
+@contextmanager
+def _shown() -> Iterator[Any]:
+    """Show progress on standard error, and leave the terminal as it was whatever happens."""
+    bar = _Bar() if sys.stderr.isatty() else _Lines()
+    try:
+        yield bar
+    finally:
+        bar.stop()
+
+
+class _Bar:
+    """A bar with rate and remaining time."""
+
+    def __init__(self) -> None:
+        self._bar: Any = None
+        self._task: Any = None
+
+    def begin(self, points: int, done: int, what: str) -> None:
+        """Begin another piece of work."""
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        self.stop()
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=None),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]}"),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+            transient=True,
+        )
+        self._bar.start()
+        self._task = self._bar.add_task(what, total=points, completed=done, rate="")
+        self._done, self._start = 0, time.monotonic()
+
+    def advance(self, points: int) -> None:
+        """Move the bar."""
+        self._done += points
+        rate = self._done / max(time.monotonic() - self._start, 1e-9)
+        self._bar.update(self._task, advance=points, rate=f"{rate:,.0f}/s")
+
+    def stop(self) -> None:
+        """Take the bar away."""
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+
+class _Lines:
+    """A line now and then, for files."""
+
+    def begin(self, points: int, done: int, what: str) -> None:
+        """Begin another piece of work."""
+        self._points, self._before, self._done, self._what = points, done, 0, what
+        self._start = self._last = time.monotonic()
+        if done and what == "computing":
+            typer.echo(f"note: {done} of {points} points are there already", err=True)
+
+    def advance(self, points: int) -> None:
+        """Say how far it is, if it has not been said for a while."""
+        self._done += points
+        now = time.monotonic()
+        if now - self._last >= EVERY:
+            self._last, rate = now, self._done / (now - self._start)
+            done = self._before + self._done
+            left = (self._points - done) / rate
+            typer.echo(f"{self._what}: {done:,} of {self._points:,} points, {rate:,.0f}/s, {left:.0f} s left", err=True)
+
+    def stop(self) -> None:
+        """Nothing to take away."""

@@ -1,0 +1,343 @@
+"""The answers of some points of a study, in batches.
+
+Points that differ in link probability and in noises given as numbers (model.Q, model.R, initial.P) only are one batch
+(`stochfuse.batches`).  Where a method makes no batch, or a batch has no answer, noises are gone through one by one, all
+link probabilities of one together; and where that has no answer, point by point, so that an error is its point's alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from stochfuse import batches
+from stochfuse.checks import LARGEST, covariance_fault
+from stochfuse.errors import ScenarioError, StochfuseError
+from stochfuse.messages import message_load
+from stochfuse.methods import predict_several
+from stochfuse.model import Noises
+from stochfuse.prediction import Prediction
+from stochfuse.scenario import Scenario
+from stochfuse.studies.plan import ERROR, MESSAGES, NODES, SETTINGS, Plan, default_method, put
+
+LINK, Q, R, P0 = "network.link", "model.Q", "model.R", "initial.P"
+BATCHED = (LINK, Q, R, P0)
+"""Keys whose numbers make a batch; a noise's number is that multiple of the identity."""
+PEDIGREES = ("local-fusion-graph", "optimal")
+"""Estimators whose messages bring all that is new to the receiver; the others send their latest estimate."""
+FAILED = 0
+"""Number of steps of a point without an answer: it has one row."""
+
+
+Kind = tuple[str, str, str]
+"""Method, estimator and nature."""
+
+
+class Answers(NamedTuple):
+    """What became of some points, in their order.
+
+    Parameters
+    ----------
+    steps : (points,) number of steps, or `FAILED`.
+    values : (rows, columns) value columns; one row per step of every point, and one for a failed point.
+    what : (points,) index into `kinds`.
+    kinds : method, estimator and nature that some points have in common.
+    errors : reason, by the number of the point.
+    """
+
+    steps: np.ndarray
+    values: np.ndarray
+    what: np.ndarray
+    kinds: tuple[Kind, ...]
+    errors: Mapping[int, str]
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Rows of every point, (points,)."""
+        return np.maximum(self.steps, 1)
+
+
+class _Group(NamedTuple):
+    """Points of one structure.
+
+    Parameters
+    ----------
+    values : (points, steps, columns).
+    what : (points,) code of each point's kind.
+    kinds : codes of kinds.
+    errors : reasons by place in the group.
+    """
+
+    values: np.ndarray
+    what: np.ndarray
+    kinds: dict[Kind, int]
+    errors: dict[int, str]
+
+    @classmethod
+    def empty(cls, size: int, steps: int, columns: int, kind: Kind) -> _Group:
+        """Points without answers yet."""
+        return cls(np.full((size, steps, columns), np.nan), np.zeros(size, dtype=np.int32), {kind: 0}, {})
+
+    def mark(self, items: np.ndarray, kind: Kind) -> None:
+        """Say what kind the answers of some points are of."""
+        self.what[items] = self.kinds.setdefault(kind, len(self.kinds))
+
+
+def evaluate(plan: Plan, points: range) -> Answers:
+    """Evaluate some points of a study.
+
+    Returns
+    -------
+    Answers
+        The same to the last bit whenever the same points are asked for together.
+    """
+    codes = plan.codes(points)
+    batched = [axis for axis in plan.axes if axis.name in BATCHED and axis.kind != "text"]
+    others = [axis for axis in plan.axes if axis not in batched]
+    found = []
+    for members in _alike([codes[axis.name] for axis in others], len(points)):
+        values = {axis.name: axis.value(codes[axis.name][members[0]]) for axis in others}
+        numbers = {axis.name: axis.shown(codes[axis.name][members]).astype(float) for axis in batched}
+        found.append((members, _group(plan, values, numbers, len(members))))
+    return _together(plan, points, found)
+
+
+def _alike(columns: Sequence[np.ndarray], size: int) -> list[np.ndarray]:
+    """Places of points whose entries are equal in every column, in the order of their first."""
+    if not columns:
+        return [np.arange(size)]
+    codes = [np.unique(column, return_inverse=True)[1] for column in columns]
+    _, group = np.unique(np.stack(codes, axis=1), axis=0, return_inverse=True)
+    order = np.argsort(group, kind="stable")
+    found = np.split(order, np.flatnonzero(np.diff(group[order])) + 1)
+    return sorted(found, key=lambda members: members[0])
+
+
+def _together(plan: Plan, points: range, found: Sequence[tuple[np.ndarray, _Group]]) -> Answers:
+    steps, what = np.zeros((2, len(points)), dtype=np.int32)
+    kinds: dict[Kind, int] = {}
+    errors: dict[int, str] = {}
+    for members, group in found:
+        fine = np.ones(len(members), dtype=bool)
+        fine[list(group.errors)] = False
+        steps[members[fine]] = group.values.shape[1]
+        what[members] = np.array([kinds.setdefault(kind, len(kinds)) for kind in group.kinds])[group.what]
+        errors |= {points[members[place]]: reason for place, reason in group.errors.items()}
+    first = np.concatenate([[0], np.cumsum(np.maximum(steps, 1))])
+    values = np.full((first[-1], len(plan.columns)), np.nan)
+    for members, group in found:
+        fine = np.flatnonzero(steps[members])
+        rows = first[members[fine]][:, None] + np.arange(group.values.shape[1])
+        values[rows] = group.values[fine]
+    return Answers(steps, values, what, tuple(kinds), dict(sorted(errors.items())))
+
+
+class _Asked(NamedTuple):
+    """How the points of a group are predicted."""
+
+    plan: Plan
+    method: str
+    settings: Mapping[str, Any]
+
+    @property
+    def quantities(self) -> list[str]:
+        """Quantities of the error."""
+        return [q for q in self.plan.quantities if q != MESSAGES]
+
+
+def _group(plan: Plan, values: Mapping[str, Any], numbers: Mapping[str, np.ndarray], size: int) -> _Group:
+    """Evaluate points that have `values` in common and differ in `numbers`."""
+    keys = {path: value for path, value in values.items() if path not in SETTINGS}
+    settings = {**plan.settings, **{name: value for name, value in values.items() if name in SETTINGS}}
+    method = settings.pop("method", None) or default_method(plan.example, set(settings))
+    settings = {"workers": 1, **settings}
+    asked = _Asked(plan, method, settings)
+    kind = (method, "", "")
+    try:
+        mapping = put(plan.base, keys)
+        # noises of 1 have the shapes, and the identities that numbers are multiples of
+        unit = Scenario.from_mapping(put(mapping, dict.fromkeys(numbers, 1.0)), plan.scenario_name)
+    except StochfuseError as error:
+        failed = _Group.empty(size, 0, len(plan.columns), kind)
+        failed.errors.update(dict.fromkeys(range(size), _reason(error)))
+        return failed
+    group = _Group.empty(size, unit.network.steps, len(plan.columns), kind)
+    inside = np.flatnonzero(_inside(numbers, size))
+    if len(inside) and _batch(asked, unit, numbers, inside, group):
+        rest = np.setdiff1d(np.arange(size), inside)
+    else:
+        rest = np.arange(size)
+    _by_noises(asked, mapping, numbers, rest, group)
+    if MESSAGES in plan.quantities:
+        _messages(asked, unit, numbers, group)
+    return group
+
+
+def _reason(error: Exception) -> str:
+    """Return what went wrong, on one line."""
+    if isinstance(error, ScenarioError) and error.problems:
+        return "; ".join(map(str, error.problems))
+    text = str(error) if isinstance(error, StochfuseError) else f"{type(error).__name__}: {error}"
+    return " ".join(text.split())
+
+
+def _inside(numbers: Mapping[str, np.ndarray], size: int) -> np.ndarray:
+    """Which points have numbers that a scenario takes; what is wrong with the others it says itself."""
+    fine = np.ones(size, dtype=bool)
+    for path, value in numbers.items():
+        fine &= np.isfinite(value) & (value >= 0) & (value <= (1.0 if path == LINK else LARGEST))
+        if path == R:
+            fine &= value > 0
+    return fine
+
+
+def _batch(asked: _Asked, unit: Scenario, numbers: Mapping[str, np.ndarray], items: np.ndarray, group: _Group) -> bool:
+    """Evaluate items in one batch, if they make one that has an answer."""
+
+    def times(path: str, M: np.ndarray) -> np.ndarray | None:
+        return numbers[path][items][:, None, None] * M if path in numbers else None
+
+    constant = all(M.ndim == 2 for M in (unit.model.Q, *(s.R for s in unit.sensors)))
+    if not constant or len(unit.sensors) != 1 or not (LINK in numbers or _one_link(unit)):
+        return False
+    link = numbers[LINK][items] if LINK in numbers else np.full(len(items), float(_link(unit)))
+    noises = Noises(times(Q, unit.model.Q), times(R, unit.sensors[0].R), times(P0, unit.P0))
+    try:
+        found = batches.predict(unit, link, noises, asked.method, asked.quantities, **asked.settings)
+        _fill(asked, found.predictions, items, group)
+    except Exception:
+        return False  # one by one it shows whose fault it is
+    for place, reason in found.faults.items():
+        group.errors[int(items[place])] = reason
+    for nature in ("exact", "approximate"):
+        group.mark(items[found.natures == nature], (*_kind(asked, found.predictions)[:2], nature))
+    return True
+
+
+def _one_link(scenario: Scenario) -> bool:
+    network = scenario.network
+    return network.link is not None and network.link.ndim == 0 and network.burst is None
+
+
+def _link(scenario: Scenario) -> Any:
+    return scenario.network.link
+
+
+def _by_noises(
+    asked: _Asked, mapping: Mapping[str, Any], numbers: Mapping[str, np.ndarray], items: np.ndarray, group: _Group
+) -> None:
+    """Evaluate items, those of equal noises together."""
+    noises = [path for path in numbers if path != LINK]
+    alone = asked.method == "monte-carlo" or asked.settings.get("prune", False)
+    for members in _alike([numbers[path][items] for path in noises], len(items)) if len(items) else []:
+        some = items[members]
+        values = {path: float(numbers[path][some[0]]) for path in noises}
+        if alone or not _several(asked, mapping, values, numbers, some, group):
+            for item in some:
+                _several(asked, mapping, values, numbers, np.array([item]), group)
+
+
+def _several(
+    asked: _Asked,
+    mapping: Mapping[str, Any],
+    values: Mapping[str, float],
+    numbers: Mapping[str, np.ndarray],
+    items: np.ndarray,
+    group: _Group,
+) -> bool:
+    """Predict items of equal noises; what is wrong with a single one is its error."""
+    try:
+        if LINK not in numbers:
+            scenario = Scenario.from_mapping(put(mapping, values), asked.plan.scenario_name)
+            links, rows = None, np.zeros(len(items), dtype=int)
+        else:
+            different, rows = np.unique(numbers[LINK][items], return_inverse=True)
+            first = {LINK: float(different[0])}
+            scenario = Scenario.from_mapping(put(mapping, {**values, **first}), asked.plan.scenario_name)
+            links = different.tolist()
+        found = predict_several(scenario, links, asked.method, asked.quantities, **asked.settings)
+        _fill(asked, found, items, group, rows)
+    except Exception as error:
+        if len(items) > 1:
+            return False
+        group.errors[int(items[0])] = _reason(error)
+        return True
+    group.mark(items, _kind(asked, found))
+    for p in found:
+        _check(p, rows, items, group)
+    return True
+
+
+def _fill(
+    asked: _Asked, found: Sequence[Prediction], items: np.ndarray, group: _Group, rows: np.ndarray | slice = slice(None)
+) -> None:
+    """Write the value columns of items, and note what is not finite."""
+    plan = asked.plan
+    for quantity, p in zip(asked.quantities, found, strict=True):
+        for m in map(plan.metric, plan.metrics):
+            name = f"{quantity}.{m.name}"
+            values = p.values(m, plan.agent)[rows]
+            group.values[items, :, plan.columns.index(name)] = values
+            for place, step in np.argwhere(~np.isfinite(values)):
+                reason = f"{quantity} {m.label} at step {step + 1} is not finite: it grows beyond floating point"
+                group.errors.setdefault(int(items[place]), reason)
+            if p.sampled is not None:
+                error = p.standard_error(m, plan.agent)
+                if error is not None:
+                    group.values[items, :, plan.columns.index(name + ERROR)] = error[rows]
+
+
+def _kind(asked: _Asked, found: Sequence[Prediction]) -> Kind:
+    """Return method, estimator and nature of answers: of several quantities the nature of the least certain."""
+    certain = ("exact", "sampled", "approximate", "bound")
+    natures = [
+        "approximate" if p.outcomes is not None and p.outcomes.rounding > batches.EXACT else p.nature for p in found
+    ]
+    own = next((p for p in found if p.quantity != "optimal"), found[0])
+    return asked.method, own.estimator, max(natures, key=certain.index)
+
+
+def _check(p: Prediction, rows: np.ndarray, items: np.ndarray, group: _Group) -> None:
+    """Note as its points' error what is no answer: an indefinite covariance, or one that is rounding."""
+    if p.outcomes is not None and p.outcomes.rounding > batches.WORTHLESS:
+        group.errors.update(dict.fromkeys(items.tolist(), batches.rounded(p.outcomes.rounding)))
+    P = p.moments.P[rows]
+    if covariance_fault(P) is None:
+        return
+    for place, item in enumerate(items):
+        for step in range(P.shape[1]):
+            fault = covariance_fault(P[place, step])
+            if fault is not None:
+                group.errors.setdefault(int(item), f"the covariance at step {step + 1} is {fault}")
+
+
+def _messages(asked: _Asked, unit: Scenario, numbers: Mapping[str, np.ndarray], group: _Group) -> None:
+    """Write the expected message load, which depends on the network alone."""
+    column = asked.plan.columns.index(NODES)
+    fine = np.setdiff1d(np.arange(len(group.what)), list(group.errors))
+    if not len(fine):
+        return
+    links, rows = (None, np.zeros(len(fine), dtype=int))
+    if LINK in numbers:
+        links, rows = np.unique(numbers[LINK][fine], return_inverse=True)
+    for (_, estimator, _), code in group.kinds.items():
+        some = np.flatnonzero(group.what[fine] == code)
+        if not len(some):
+            continue
+        try:
+            load = _load(unit, links, estimator, asked.plan.agent)
+        except Exception as error:
+            group.errors.update(dict.fromkeys(fine[some].tolist(), _reason(error)))
+        else:
+            group.values[fine[some], :, column] = load[rows[some]]
+
+
+def _load(scenario: Scenario, links: np.ndarray | None, estimator: str, agent: int | str) -> np.ndarray:
+    """Expected nodes that an agent receives in each step, (links, steps)."""
+    rule = "local-fusion-graph" if estimator in PEDIGREES else "naive"
+    load = message_load(scenario, links, rule)
+    whose = agent if isinstance(agent, int) else "mean"
+    each = np.stack([load.between(k, k).mean(whose) for k in map(int, load.steps)], axis=1)
+    return 0.0 * each if estimator == "stand-alone" else each
