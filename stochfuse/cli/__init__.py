@@ -21,5 +21,14 @@ def main() -> None:
         sys.stdout = None
         sys.exit(f"error: cannot write to standard output: {error.strerror or error}")
     except KeyboardInterrupt:
-        sys.stderr.write("interrupted\n")
-        sys.exit(130)
+        _interrupted()
+    except RuntimeError as error:
+        # Python 3.11 wraps whatever happens while a class is being made
+        if not isinstance(error.__cause__, KeyboardInterrupt):
+            raise
+        _interrupted()
+
+
+def _interrupted() -> None:
+    sys.stderr.write("interrupted\n")
+    sys.exit(130)

@@ -67,7 +67,9 @@ def study(
     ] = None,
     where: Annotated[
         list[str] | None,
-        typer.Option(metavar="KEY=VALUE", help="Value of a key that the plot is not drawn over; may be repeated."),
+        typer.Option(
+            metavar="KEY=VALUE", help="Only points with this value of a key, in the plot or the front; may be repeated."
+        ),
     ] = None,
     kind: Annotated[Kind, typer.Option(help="What is drawn over two keys.")] = Kind.heat,
     digits: DigitsOption = 5,
@@ -84,9 +86,10 @@ def study(
     from stochfuse.studies.running import study as run
 
     check_files(output, plot, study)
-    for option, given in (("--over", over is not None), ("--where", bool(where))):
-        if given and (plot is None or pareto):
-            raise UsageError(f"{option}: expected --plot without --pareto")
+    if over is not None and (plot is None or pareto):
+        raise UsageError("--over: expected --plot without --pareto")
+    if where and plot is None and not pareto:
+        raise UsageError("--where: expected --plot or --pareto")
     if dask is not None and workers != 1:
         raise UsageError("--workers: expected nothing with --dask, whose cluster has its own")
     with _executor(dask, workers) as (executor, width), _shown() as progress:
@@ -102,7 +105,7 @@ def study(
             raise
     _tell(results)
     if pareto:
-        _pareto(results, column, step, plot, digits, format)
+        _pareto(results, column, step, _pairs(where or []), plot, digits, format)
         return
     if plot is not None:
         from stochfuse.report.study_plots import plot_over
@@ -121,12 +124,19 @@ def study(
 
 
 def _pareto(
-    results: Results, column: str | None, step: int | None, plot: Path | None, digits: int, format: Format | None
+    results: Results,
+    column: str | None,
+    step: int | None,
+    where: dict[str, str],
+    plot: Path | None,
+    digits: int,
+    format: Format | None,
 ) -> None:
     from stochfuse.report import studies
+    from stochfuse.report.study_slices import fixed_values
     from stochfuse.studies.pareto import pareto
 
-    front = pareto(results, column, step)
+    front = pareto(results, column, step, fixed_values(results.plan, where))
     for note in front.notes:
         typer.echo(f"note: {note}", err=True)
     if plot is not None:

@@ -116,6 +116,7 @@ class ParetoFront:
     method, estimator, nature : (n,) how they were predicted.
     compared : how many points were compared.
     notes : what the reader must know to compare them.
+    fixed : values of keys that all compared points have.
     """
 
     column: str
@@ -131,9 +132,24 @@ class ParetoFront:
     nature: np.ndarray
     compared: int
     notes: tuple[str, ...] = ()
+    fixed: Mapping[str, Any] = field(default_factory=dict)
+
+    def there(self, block: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Which points of a block of results, with "point" and the keys, have the fixed values."""
+        return holds(self.fixed, block)
 
 
-def pareto(results: Results, column: str | None = None, step: int | None = None) -> ParetoFront:
+def holds(fixed: Mapping[str, Any], block: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Which points of a block of results have some values."""
+    there = np.ones(len(block["point"]), dtype=bool)
+    for name, value in fixed.items():
+        there &= block[name] == value
+    return there
+
+
+def pareto(
+    results: Results, column: str | None = None, step: int | None = None, fixed: Mapping[str, Any] | None = None
+) -> ParetoFront:
     """Find the points of a study that no other one beats in both accuracy and message load.
 
     Parameters
@@ -141,6 +157,7 @@ def pareto(results: Results, column: str | None = None, step: int | None = None)
     results : of a study with "messages" among its quantities.
     column : the accuracy, a value column of claimed, actual, optimal or rms; default: the first.
     step : where the accuracy is taken; default: each point's last step.
+    fixed : values of keys: only points that have them are compared.
 
     Returns
     -------
@@ -168,11 +185,13 @@ def pareto(results: Results, column: str | None = None, step: int | None = None)
     for block, load in zip(results.blocks(sorted(asked), step), loads, strict=True):
         if len(load) != len(block["point"]):
             raise UsageError(f"step: expected a step that every point has, got {step}")
-        found = found.add(load, block[column], block)
+        some = holds(fixed or {}, block)
+        found = found.add(load[some], block[column][some], {name: values[some] for name, values in block.items()})
     if not found.seen:
         if step is not None and results.rows:
             raise UsageError(f"step: expected a step that every point has, got {step}")
-        raise NoAnswerError(f"no point of the study has a value: {results.failed} failed")
+        where = " where the keys are so" if fixed else ""
+        raise NoAnswerError(f"no point of the study has a value{where}: {results.failed} failed")
     at = found.columns
     return ParetoFront(
         column,
@@ -188,6 +207,7 @@ def pareto(results: Results, column: str | None = None, step: int | None = None)
         at["nature"],
         found.seen,
         _notes(column, at),
+        dict(fixed or {}),
     )
 
 

@@ -24,7 +24,7 @@ from stochfuse.errors import Problem, ScenarioError, StochfuseError, UsageError
 from stochfuse.metrics import Metric
 from stochfuse.metrics import metric as metric_of
 from stochfuse.names import CRITERIA, ESTIMATORS, METHODS
-from stochfuse.quantities import QUANTITIES
+from stochfuse.quantities import QUANTITIES, noun
 from stochfuse.quantities import check as check_quantity
 from stochfuse.quantities import unit as unit_of
 from stochfuse.rules import SUMS
@@ -95,9 +95,9 @@ class Plan:
                 continue
             for m in map(self.metric, self.metrics):
                 unit = unit_of(quantity, m)
-                found[f"{quantity}.{m.name}"] = f"{quantity} {m.label}{f' [{unit}]' if unit else ''}"
+                found[f"{quantity}.{m.name}"] = f"{quantity} {noun(quantity, m)}{f' [{unit}]' if unit else ''}"
                 if "monte-carlo" in self.methods:
-                    found[f"{quantity}.{m.name}{ERROR}"] = f"standard error of {quantity} {m.label}"
+                    found[f"{quantity}.{m.name}{ERROR}"] = f"standard error of {quantity} {noun(quantity, m)}"
         return found
 
     @property
@@ -306,7 +306,8 @@ def _built(record: Mapping[str, Any], name: str) -> Plan:
     if check.problems:
         raise ScenarioError(name, check.problems)
     report = given.report
-    quantities, metrics = _several(report.quantity), _several(report.metric or example.metric or "trace")
+    metric = (example.metric or "trace") if report.metric is None else report.metric
+    quantities, metrics = _several(report.quantity), _several(metric)
     _check_report(name, quantities, metrics, example)
     if isinstance(report.agent, int) and report.agent > example.network.agents and "network.agents" not in varied:
         expected = f"an agent from 1 to {example.network.agents}"

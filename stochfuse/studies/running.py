@@ -172,7 +172,8 @@ def _answered(executor: Executor, width: int, record: str, todo: Iterable[int]) 
     try:
         while True:
             for chunk in islice(chunks, WAITING * width - len(waiting)):
-                waiting[executor.submit(answer, record, chunk)] = chunk
+                with _undisturbed():
+                    waiting[executor.submit(answer, record, chunk)] = chunk
             if not waiting:
                 return
             finished, _ = wait(list(waiting), return_when=FIRST_COMPLETED)
@@ -230,9 +231,24 @@ def _executor(given: Executor | None, workers: int) -> Iterator[tuple[Executor, 
                 os.environ[name] = value
 
 
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Let Ctrl-C wait while a worker may be started, who inherits that it waits until `_begin` ignores it."""
+    if not hasattr(signal, "pthread_sigmask") or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _begin() -> None:
     """Leave Ctrl-C to the process that hands out the work, and end with it, also if it is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()

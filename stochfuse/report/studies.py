@@ -1,0 +1,303 @@
+"""What a study found, in a few numbers, and what pays in it (Pareto), as table, CSV and JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from stochfuse import __version__
+from stochfuse.report.predictions import counted
+from stochfuse.report.study_words import (
+    HOW,
+    design,
+    failures,
+    json_of,
+    load_label,
+    plain,
+    shortened,
+    spoken,
+    study_json,
+    whose,
+    words_of,
+)
+from stochfuse.report.table import Table, number, to_csv
+from stochfuse.studies.pareto import ParetoFront
+
+if TYPE_CHECKING:
+    from stochfuse.studies.results import Results
+
+SCHEMA = "stochfuse.study-summary/1"
+PARETO_SCHEMA = "stochfuse.pareto/1"
+
+
+class Extreme(NamedTuple):
+    """The least or greatest value of a column, and where it is.
+
+    Parameters
+    ----------
+    column, extreme : which column, "least" or "greatest".
+    value, point, step : the value, its point and that point's last step.
+    keys : the point's values of every varied key.
+    method, estimator, nature : how it was predicted.
+    """
+
+    column: str
+    extreme: str
+    value: float
+    point: int
+    step: int
+    keys: Mapping[str, Any]
+    method: str
+    estimator: str
+    nature: str
+
+
+@dataclass(frozen=True, eq=False)
+class Summary:
+    """What a study found, in a few numbers.
+
+    Parameters
+    ----------
+    extremes : least and greatest value of every value column after each point's last step.
+    natures : how many points are exact, approximate, bound, sampled.
+    """
+
+    extremes: tuple[Extreme, ...]
+    natures: Mapping[str, int]
+
+
+def summarise(results: Results) -> Summary:
+    """Go through the results once, block by block; of equal extremes the first point is named."""
+    plan = results.plan
+    keys = [axis.name for axis in plan.axes]
+    asked = tuple(dict.fromkeys(["point", "step", *keys, *HOW, *plan.columns]))
+    found: dict[tuple[str, str], Extreme] = {}
+    natures: dict[str, int] = {}
+    for block in results.blocks(asked):
+        for name, count in zip(*np.unique(block["nature"].astype(str), return_counts=True), strict=True):
+            natures[str(name)] = natures.get(str(name), 0) + int(count)
+        for column in plan.columns:
+            values = np.asarray(block[column], dtype=float)
+            if np.isnan(values).all():  # standard errors of points that are not sampled
+                continue
+            for extreme, sign, where in (("least", 1, np.nanargmin), ("greatest", -1, np.nanargmax)):
+                here = _extreme(column, extreme, block, int(where(values)), keys)
+                best = found.get((column, extreme))
+                if best is None or sign * (best.value - here.value) > 0:
+                    found[column, extreme] = here
+    order = [(column, extreme) for column in plan.columns for extreme in ("least", "greatest")]
+    return Summary(tuple(found[at] for at in order if at in found), dict(sorted(natures.items())))
+
+
+def _extreme(column: str, extreme: str, block: Mapping[str, np.ndarray], i: int, keys: Sequence[str]) -> Extreme:
+    at = {key: plain(block[key][i]) for key in keys}
+    how = (str(block[name][i]) for name in HOW)
+    return Extreme(column, extreme, float(block[column][i]), int(block["point"][i]), int(block["step"][i]), at, *how)
+
+
+def summary_table(results: Results, digits: int = 5) -> Table:
+    """Return least and greatest value of every value column, with the point where, under what the study is."""
+    summary, plan = summarise(results), results.plan
+    keys = [axis.name for axis in plan.axes]
+    words = [words_of(axis.values) for axis in plan.axes]
+    rows = tuple(
+        (
+            e.column,
+            e.extreme,
+            number(e.value, digits),
+            str(e.point),
+            str(e.step),
+            *(shortened(e.keys[key], known) for key, known in zip(keys, words, strict=True)),
+        )
+        for e in summary.extremes
+    )
+    return Table(titles(results, summary), ("column", ""), ("value", "point", "k", *keys), rows)
+
+
+def titles(results: Results, summary: Summary) -> tuple[str, ...]:
+    """Lines that say what the study is, how much of it there is and what the columns mean."""
+    plan = results.plan
+    natures = "; ".join(f"{nature}: {counted(n, 'point')}" for nature, n in summary.natures.items())
+    return (
+        f"Study {plan.name}: {design(plan)}",
+        f"Scenario {plan.scenario_name}; {whose(plan)}",
+        f"{results.path.name}: {counted(results.rows, 'row')}, {failures(results.failed)}",
+        *(f"failed: {points}: {reason}" for points, reason in _together(results.first_errors)),
+        *([natures] if natures else []),
+        *(f"{column}: {spoken(plan, column)}" for column in plan.columns),
+        "least and greatest after each point's last step",
+    )
+
+
+def _together(errors: Sequence[tuple[int, str]]) -> list[tuple[str, str]]:
+    """Points that failed for the same reason, and the reason."""
+    found: dict[str, list[str]] = {}
+    for point, reason in errors:
+        found.setdefault(reason, []).append(str(point))
+    return [(f"point{'s' * (len(points) > 1)} {', '.join(points)}", reason) for reason, points in found.items()]
+
+
+def summary_csv(results: Results) -> str:
+    """One line per value column and extreme, with the point where it is."""
+    summary, plan = summarise(results), results.plan
+    keys = [axis.name for axis in plan.axes]
+    how = [name for name in HOW if name not in keys]
+    headings = (
+        "study",
+        "points",
+        "rows",
+        "failed",
+        "column",
+        "label",
+        "extreme",
+        "value",
+        "point",
+        "step",
+        *keys,
+        *how,
+    )
+    start = (plan.name, plan.size, results.rows, results.failed)
+    return to_csv(
+        headings,
+        [
+            (
+                *start,
+                e.column,
+                spoken(plan, e.column),
+                e.extreme,
+                e.value,
+                e.point,
+                e.step,
+                *e.keys.values(),
+                *(getattr(e, name) for name in how),
+            )
+            for e in summary.extremes
+        ],
+    )
+
+
+def summary_json(results: Results) -> dict[str, Any]:
+    """Return the object of schema stochfuse.study/1."""
+    summary, plan = summarise(results), results.plan
+    columns: dict[str, Any] = {column: {"label": spoken(plan, column)} for column in plan.columns}
+    for e in summary.extremes:
+        columns[e.column][e.extreme] = {
+            "value": e.value,
+            "point": e.point,
+            "step": e.step,
+            "keys": {key: json_of(value) for key, value in e.keys.items()},
+            **{name: getattr(e, name) for name in HOW},
+        }
+    return {
+        "schema": SCHEMA,
+        "version": __version__,
+        **study_json(plan),
+        "file": str(results.path),
+        "points": plan.size,
+        "rows": results.rows,
+        "failed": results.failed,
+        "first_errors": [{"point": point, "reason": reason} for point, reason in results.first_errors],
+        "natures": dict(summary.natures),
+        "columns": columns,
+        "meta": {"description": list(titles(results, summary))},
+    }
+
+
+def pareto_titles(found: ParetoFront, results: Results) -> tuple[str, ...]:
+    """Lines that say what is compared and how exact it is."""
+    plan = results.plan
+    natures = ", ".join(sorted(set(found.nature.tolist())))
+    when = "each point's last step" if found.step is None else f"step {found.step}"
+    fixed = "".join(f", {name} = {shortened(value)}" for name, value in found.fixed.items())
+    return (
+        f"Study {plan.name}: accuracy against message load; no point does better in both than {_these(found)}",
+        f"Scenario {plan.scenario_name}; {whose(plan)}; {counted(found.compared, 'point')} compared{fixed}, "
+        f"{failures(results.failed)}",
+        f"load: {load_label(plan)}",
+        f"accuracy: {spoken(plan, found.column)}, after {when}; {natures}"
+        + ("; ± one standard error" if found.error is not None else ""),
+    )
+
+
+def _these(found: ParetoFront) -> str:
+    n = len(found.points)
+    return "this one" if n == 1 else f"these {n:,}"
+
+
+def pareto_table(found: ParetoFront, results: Results, digits: int = 5) -> Table:
+    """Return the front by rising load, with the keys of its points, under what is compared."""
+    how = _how(found)
+    words = [words_of(axis.values) for axis in results.plan.axes]
+    errors = np.full(len(found.points), np.nan) if found.error is None else found.error
+    rows = []
+    for i, (load, accuracy, error) in enumerate(zip(found.load, found.accuracy, errors, strict=True)):
+        cells = [shortened(found.keys[key][i], known) for key, known in zip(found.keys, words, strict=True)]
+        sampled = f" ±{error:.2g}" if np.isfinite(error) else ""
+        shown = number(float(load), digits) if load else "0"
+        rows.append(
+            (
+                str(found.points[i]),
+                shown,
+                number(float(accuracy), digits) + sampled,
+                *cells,
+                *(str(h[i]) for h in how.values()),
+            )
+        )
+    return Table(pareto_titles(found, results), ("point",), ("load", "accuracy", *found.keys, *how), tuple(rows))
+
+
+def _how(found: ParetoFront) -> dict[str, np.ndarray]:
+    """Method, estimator and nature as far as points differ in them and no key says it."""
+    each = {name: getattr(found, name) for name in HOW if name not in found.keys}
+    return {name: values for name, values in each.items() if len(set(values.tolist())) > 1}
+
+
+def pareto_csv(found: ParetoFront, results: Results) -> str:
+    """One line per point of the front, with everything that says what it is."""
+    how = [name for name in HOW if name not in found.keys]
+    headings = ("study", "point", "step", "load", "column", "label", "accuracy", "standard_error", *found.keys, *how)
+    label = spoken(results.plan, found.column)
+    rows = []
+    for i, point in enumerate(found.points.tolist()):
+        error = "" if found.error is None or not np.isfinite(found.error[i]) else float(found.error[i])
+        keys = [plain(values[i]) for values in found.keys.values()]
+        start = (results.plan.name, point, int(found.steps[i]), float(found.load[i]))
+        rows.append(
+            (*start, found.column, label, float(found.accuracy[i]), error, *keys, *(getattr(found, n)[i] for n in how))
+        )
+    return to_csv(headings, rows)
+
+
+def pareto_json(found: ParetoFront, results: Results) -> dict[str, Any]:
+    """Return the object of schema stochfuse.pareto/1."""
+    points = []
+    for i, point in enumerate(found.points.tolist()):
+        error = None if found.error is None or not np.isfinite(found.error[i]) else float(found.error[i])
+        points.append(
+            {
+                "point": point,
+                "step": int(found.steps[i]),
+                "load": float(found.load[i]),
+                "accuracy": float(found.accuracy[i]),
+                **({} if error is None else {"standard_error": error}),
+                "keys": {key: json_of(values[i]) for key, values in found.keys.items()},
+                **{name: str(getattr(found, name)[i]) for name in HOW},
+            }
+        )
+    return {
+        "schema": PARETO_SCHEMA,
+        "version": __version__,
+        **study_json(results.plan),
+        "column": found.column,
+        "accuracy": spoken(results.plan, found.column),
+        "load": load_label(results.plan),
+        "step": found.step,
+        "where": {name: json_of(value) for name, value in found.fixed.items()},
+        "compared": found.compared,
+        "failed": results.failed,
+        "front": points,
+        "meta": {"description": list(pareto_titles(found, results)), "notes": list(found.notes)},
+    }
