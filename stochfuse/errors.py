@@ -41,5 +41,9 @@ class UsageError(StochfuseError, ValueError):
     """A request that does not fit the scenario or the method."""
 
 
+class NotABatch(UsageError):  # noqa: N818
+    """Scenarios that cannot be evaluated together, or not by this method; one by one they may have answers."""
+
+
 class NoAnswerError(StochfuseError):
     """The question has no answer: the filter diverges, the target cannot be reached."""

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,11 +30,11 @@ from stochfuse.engines.enumeration import (
     expectation,
 )
 from stochfuse.errors import StochfuseError, UsageError
-from stochfuse.estimators import Claims
+from stochfuse.estimators import Claims, Made
 from stochfuse.events import MOST_AGENTS_RELABELLED, events, orbits, relabellings
 from stochfuse.kalman import Estimate
 from stochfuse.metrics import Metric
-from stochfuse.network import LinkRows, Network, number_of_senders
+from stochfuse.network import LinkRows, Network, number_of_senders, uniform_rows
 from stochfuse.quantities import Moments, linear, matrix, number, value
 from stochfuse.rules import make
 from stochfuse.scenario import Scenario
@@ -314,6 +314,59 @@ def outcomes(
     UsageError
         If the outcomes are too many, or a covariance has no inverse.
     """
+    found = enumerated(
+        scenario,
+        rows,
+        estimator,
+        records=records,
+        errors=errors,
+        max_graphs=max_graphs,
+        prune=prune,
+        plain=plain,
+        criterion=criterion,
+        progress=progress,
+    )
+    of = moments if errors else itself
+    return Outcomes(scenario, rows, found.groups, found.structure, found.made.claims(), found.weights, of)
+
+
+class Enumerated(NamedTuple):
+    """All outcomes of a scenario before any number is put in.
+
+    Parameters
+    ----------
+    groups : agents that are alike.
+    structure : the outcomes.
+    made : the estimator that has written them down, and what its values claim.
+    weights : bookkeeping of probabilities.
+    """
+
+    groups: tuple[tuple[int, ...], ...]
+    structure: Structure
+    made: Made
+    weights: Any
+
+
+def enumerated(
+    scenario: Scenario,
+    rows: LinkRows,
+    estimator: str,
+    *,
+    records: np.ndarray | None = None,
+    errors: bool = False,
+    max_graphs: int = 100_000,
+    prune: bool = False,
+    plain: bool = False,
+    criterion: str = "det",
+    progress: Progress | None = None,
+    polynomial: bool = False,
+) -> Enumerated:
+    """Enumerate all outcomes of a scenario; parameters and errors are those of `outcomes`.
+
+    Parameters
+    ----------
+    polynomial : count successes although links differ: those that there are, are equally likely.
+    """
     network = scenario.network
     check_size(network)
     # records tell like agents apart
@@ -328,7 +381,8 @@ def outcomes(
     if rows.bursts is not None:
         weights = bursty(per_step[0], len(rows.link))
     else:
-        weights = Rows(len(rows.link)) if prune else weights_for(network, rows, sum(map(len, per_step)))
+        alike = uniform_rows([0.5]) if polynomial else rows
+        weights = Rows(len(rows.link)) if prune else weights_for(network, alike, sum(map(len, per_step)))
     groups = groups_alike(network, rows, kinds, permutations)
     request = Request(
         agents=network.agents,
@@ -341,9 +395,7 @@ def outcomes(
         prune=prune,
         plain=plain,
     )
-    structure = enumerate_outcomes(made.estimator, request, progress)
-    of = moments if errors else itself
-    return Outcomes(scenario, rows, groups, structure, made.claims(), weights, of)
+    return Enumerated(groups, enumerate_outcomes(made.estimator, request, progress), made, weights)
 
 
 def groups_alike(

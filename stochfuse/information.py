@@ -184,7 +184,8 @@ def evaluate(ledger: Ledger, sources: Sources) -> Information:
     Returns
     -------
     Information
-        Y of shape (values, d, d) and y of shape (values, d, columns), None without records.
+        Y of shape (values, d, d) and y of shape (values, d, columns), None without records.  Sources of a batch: with
+        the items' axis after that of the values.
 
     Raises
     ------
@@ -193,35 +194,58 @@ def evaluate(ledger: Ledger, sources: Sources) -> Information:
     UsageError
         If a predicted covariance has no inverse.
     """
-    d = sources.model.dimension
-    states = sources.records is not None
-    width = d + (sources.starts[0].y.shape[-1] if states else 0)
-    atoms, values = np.empty((len(ledger.atoms), d, width)), np.empty((len(ledger.sums), d, width))
-    kinds = [kind for kind, _, _ in ledger.atoms]
-    of = np.array([of for _, _, of in ledger.atoms])
-    atom_step, value_step = np.array([step for _, step, _ in ledger.atoms]), np.array(ledger.step)
-    prior = np.array([kind == PRIOR for kind in kinds])
-    for step in range(1, int(value_step.max()) + 1):
+
+    def total(values: np.ndarray, atoms: np.ndarray) -> np.ndarray:
+        terms = [ledger.sums[value] for value in values]
+        which, times = np.array([pair for sum_ in terms for pair in sum_], dtype=int).T
+        first = np.cumsum([0] + [len(sum_) for sum_ in terms[:-1]])
+        return np.add.reduceat(times.reshape(-1, *(1,) * (atoms.ndim - 1)) * atoms[which], first, axis=0)
+
+    atoms, value_step = evaluate_atoms(ledger.atoms, sources, total), np.array(ledger.step)
+    values = np.empty((len(ledger.sums), *atoms.shape[1:]))
+    for step in np.unique(value_step):
+        here = np.flatnonzero(value_step == step)
+        values[here] = total(here, atoms)
+    return unpacked(values, sources)
+
+
+def evaluate_atoms(
+    atoms: Sequence[tuple[str, int, int]], sources: Sources, total: Callable[[np.ndarray, np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Every atom of a ledger as floating-point numbers, (atoms, …, d, width), Y and y side by side; see `unpacked`.
+
+    Parameters
+    ----------
+    atoms : of the ledger.
+    sources : what they stand for; of a batch, starts and noises have the items' axis before their own two.
+    total : sums up some of the ledger's values from all atoms; those of later steps do not hold numbers yet.
+
+    Raises
+    ------
+    NoAnswerError, UsageError
+        As `evaluate`.
+    """
+    start = sources.starts[0]
+    width = start.Y.shape[-1] + (0 if sources.records is None else start.y.shape[-1])
+    out = np.empty((len(atoms), *start.Y.shape[:-1], width))
+    of, atom_step = np.array([of for _, _, of in atoms]), np.array([step for _, step, _ in atoms])
+    prior = np.array([kind == PRIOR for kind, _, _ in atoms])
+    for step in range(1, int(atom_step.max()) + 1):
         brought = np.flatnonzero(prior & (atom_step == step))
         if len(brought):
-            before = _pair(values[of[brought]], d, states)
+            before = unpacked(total(of[brought], out), sources)
             check_definite(before.Y, step - 1, rounding=1e-9)
             try:
-                atoms[brought] = _packed(sources.forward(before, step))
+                out[brought] = _packed(sources.forward(before, step))
             except np.linalg.LinAlgError:
                 raise UsageError(
                     f"the covariance predicted for step {step} is singular, and the common information is its inverse: "
                     "expected an invertible model.F, or a model.Q that fills what it leaves out"
                 ) from None
-        for atom in np.flatnonzero(~prior & (atom_step == step)):
-            source = int(of[atom])
-            atoms[atom] = _packed(sources.starts[source] if kinds[atom] == START else sources.measured(step, source))
-        here = np.flatnonzero(value_step == step)
-        terms = [ledger.sums[value] for value in here]
-        which, times = np.array([pair for sum_ in terms for pair in sum_], dtype=int).T
-        first = np.cumsum([0] + [len(sum_) for sum_ in terms[:-1]])
-        values[here] = np.add.reduceat(times[:, None, None] * atoms[which], first, axis=0)
-    return _pair(values, d, states)
+        for atom in np.flatnonzero(~prior & (atom_step == step)).tolist():
+            kind, _, source = atoms[atom]
+            out[atom] = _packed(sources.starts[source] if kind == START else sources.measured(step, source))
+    return out
 
 
 class InformationClaims:
@@ -249,10 +273,22 @@ class InformationClaims:
             If some sum is no positive-definite information.
         """
         Y: Any = sum(sign * self._Y[values] for sign, values in terms)
-        check_definite(Y, step)
         y = None if self._y is None else sum(sign * self._y[values] for sign, values in terms)
-        estimate = from_information(Information(y, Y))
-        return estimate, float((_diagonal(estimate.P) * _diagonal(Y)).max())
+        estimate, magnified = estimated(Information(y, Y), step)
+        return estimate, float(magnified.max())
+
+
+def estimated(information: Information, step: int) -> tuple[Estimate, np.ndarray]:
+    """Return estimates from information claimed at a step, and by how much rounding grew in each component, (..., d).
+
+    Raises
+    ------
+    NoAnswerError
+        If some information is not positive definite.
+    """
+    check_definite(information.Y, step)
+    estimate = from_information(information)
+    return estimate, _diagonal(estimate.P) * _diagonal(information.Y)
 
 
 def evaluate_exactly(ledger: Ledger, sources: Sources) -> list[Information]:
@@ -285,8 +321,10 @@ def _packed(information: Information) -> np.ndarray:
     return Y if y is None else np.concatenate([Y, y], axis=-1)
 
 
-def _pair(packed: np.ndarray, d: int, states: bool) -> Information:
-    return Information(packed[..., d:] if states else None, packed[..., :d])
+def unpacked(packed: np.ndarray, sources: Sources) -> Information:
+    """Return the information pairs that stand side by side in an array."""
+    d = sources.model.dimension
+    return Information(None if sources.records is None else packed[..., d:], packed[..., :d])
 
 
 def check_definite(Y: np.ndarray, step: int, *, rounding: float = 0.0) -> None:

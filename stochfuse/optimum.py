@@ -21,18 +21,10 @@ def optimum(scenario: Scenario, rows: LinkRows) -> tuple[Chain, tuple[tuple[int,
     UsageError
         If the chain's states or paths are too many.
     """
-    require_one_state(scenario, "the optimum")
-    require_independent_noise(scenario, "the optimum")
-    network, kinds = scenario.network, scenario.sensor_of
-    alike = len(set(kinds)) == 1 and rows.uniform
-    groups = (
-        (tuple(range(network.agents)),)
-        if alike
-        else groups_alike(network, rows, kinds, relabellings(network, rows, kinds))
-    )
-    chain = contacts(network, rows, kinds, groups)
-    given = Filter(scenario.model, scenario.sensors, scenario.P0, scenario.correlation == "shared", scenario.error)
-    plain = alike and network.delay == (1.0,) and rows.bursts is None
+    network = scenario.network
+    groups = groups_of(scenario, rows)
+    chain, given = contacts(network, rows, scenario.sensor_of, groups), filter_of(scenario)
+    plain = counted(scenario, rows)
     try:
         if plain:
             check_size(number_of_paths(network))
@@ -40,3 +32,33 @@ def optimum(scenario: Scenario, rows: LinkRows) -> tuple[Chain, tuple[tuple[int,
     except TooManyPathsError:
         found = enclosed_optimum(given, chain, network.steps, len(rows.link))
     return found._replace(paths=number_of_paths(network)) if plain else found, groups
+
+
+def groups_of(scenario: Scenario, rows: LinkRows) -> tuple[tuple[int, ...], ...]:
+    """Return the agents that are alike, whose optimum is the same.
+
+    Raises
+    ------
+    UsageError
+        If the contact chain is not one for such a scenario.
+    """
+    require_one_state(scenario, "the optimum")
+    require_independent_noise(scenario, "the optimum")
+    network, kinds = scenario.network, scenario.sensor_of
+    if _alike(scenario, rows):
+        return (tuple(range(network.agents)),)
+    return groups_alike(network, rows, kinds, relabellings(network, rows, kinds))
+
+
+def filter_of(scenario: Scenario) -> Filter:
+    """Return the filter of an agent that loses nothing."""
+    return Filter(scenario.model, scenario.sensors, scenario.P0, scenario.correlation == "shared", scenario.error)
+
+
+def counted(scenario: Scenario, rows: LinkRows) -> bool:
+    """Whether `number_of_paths` is that of the scenario's chain."""
+    return _alike(scenario, rows) and scenario.network.delay == (1.0,) and rows.bursts is None
+
+
+def _alike(scenario: Scenario, rows: LinkRows) -> bool:
+    return len(set(scenario.sensor_of)) == 1 and rows.uniform

@@ -35,10 +35,13 @@ import numpy as np
 
 from stochfuse.algebra import NUMPY, Algebra, inverse
 from stochfuse.arrivals import Counts, like_senders, poisson_binomial
-from stochfuse.engines.mean_field import Case, Outcomes, run, run_like
-from stochfuse.errors import UsageError
+from stochfuse.averaged import sound
+from stochfuse.checks import covariance_fault
+from stochfuse.engines.mean_field import COMMON, Case, Outcomes, run, run_like
+from stochfuse.errors import NoAnswerError, UsageError
 from stochfuse.kalman import Estimate, from_information, to_information, update, update_information
-from stochfuse.network import LinkRows, number_of_senders, possible_senders, require_memoryless
+from stochfuse.model import Noises
+from stochfuse.network import LinkRows, Network, number_of_senders, possible_senders, require_memoryless
 from stochfuse.scenario import Scenario, require_independent_noise, require_one_state
 
 MOST_OUTCOMES = 100_000
@@ -119,6 +122,8 @@ def covariances(scenario: Scenario, rows: LinkRows) -> Covariances:
     UsageError
         If messages are delayed, unlike agents make too many outcomes, or agents do not track one state with independent
         noises.
+    NoAnswerError
+        If a covariance grows beyond floating point.
     """
     require_one_state(scenario, "method simplified")
     require_independent_noise(scenario, "method simplified")
@@ -127,16 +132,42 @@ def covariances(scenario: Scenario, rows: LinkRows) -> Covariances:
     for group in all_groups:
         if isinstance(group.case, Case):
             P, cancelled = run_like(group.case, steps)
-            forms |= {"square-root"} if cancelled.any() else set()
-            forms |= {"measurement-space"} if not cancelled.all() else set()
+            forms |= forms_used(cancelled)
         else:
             P = np.empty((steps, *scenario.P0.shape, group.case.items))
-            run(group.case, steps, P)
+            with np.errstate(all="ignore"):
+                run(group.case, steps, P)
             forms.add("outcomes")
+        if not np.isfinite(P).all():
+            item, why = min(faults(P).items())
+            µ = rows.means(scenario.network)[item // group.columns]
+            raise NoAnswerError(f"method simplified: {why} (link probability {µ:g})")
         d = P.shape[1]
         parts.append(P.reshape(steps, d, d, links, group.columns).transpose(3, 0, 4, 1, 2))
     P = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=2)
     return Covariances(P, index_of_groups(all_groups, scenario.network.agents), tuple(sorted(forms)))
+
+
+def forms_used(cancelled: np.ndarray) -> set[str]:
+    """Return the numeric forms of like agents, from whether each item needed the square-root form."""
+    used = {"square-root"} if cancelled.any() else set()
+    return used | ({"measurement-space"} if not cancelled.all() else set())
+
+
+def faults(P: np.ndarray) -> dict[int, str]:
+    """Why covariances (steps, d, d, items) are none, per item where one is not: the first step and what is wrong."""
+    found: dict[int, str] = {}
+    for step in range(len(P), 0, -1):
+        now = np.moveaxis(P[step - 1], -1, 0)
+        suspects = np.flatnonzero(~sound(P[step - 1]))
+        finite = np.isfinite(now[suspects]).all(axis=(1, 2))
+        lost = f"the covariance at step {step} is not finite: it grows beyond floating point"
+        found |= dict.fromkeys(suspects[~finite].tolist(), lost)
+        for item in suspects[finite]:
+            fault = covariance_fault(now[item])
+            if fault is not None:
+                found[int(item)] = f"expected a covariance at step {step}, got {fault}"
+    return found
 
 
 def index_of_groups(all_groups: Sequence[Group], agents: int) -> np.ndarray:
@@ -145,6 +176,22 @@ def index_of_groups(all_groups: Sequence[Group], agents: int) -> np.ndarray:
     for column, members in enumerate(members for group in all_groups for members in group.agents):
         index[list(members)] = column
     return index
+
+
+def reach_of_rounding(scenario: Scenario, rows: LinkRows) -> np.ndarray:
+    """Relative error that rounding may cause in the covariance of like agents at some step, for every row of links.
+
+    At three or four times the cost of the square-root form; see `stochfuse.engines.rounding`.  Zeros for unlike agents,
+    for whom it is not known.
+    """
+    from stochfuse.engines.rounding import rounding
+
+    reach = np.zeros(len(rows.link))
+    for group in groups(scenario, rows):
+        if isinstance(group.case, Case):
+            of_items = rounding(group.case, run_like(group.case, scenario.network.steps)[0])
+            reach = np.maximum(reach, of_items.reshape(len(rows.link), -1).max(axis=1))
+    return reach
 
 
 def departures(scenario: Scenario, rows: LinkRows) -> list[str]:
@@ -166,11 +213,16 @@ def departures(scenario: Scenario, rows: LinkRows) -> list[str]:
     return notes
 
 
+def require_prompt(network: Network) -> None:
+    """Raise UsageError if messages may be delayed."""
+    if network.delay[0] != 1.0:
+        raise UsageError("method 'simplified' is derived without delay (thesis 4.2); network.delay must be 0")
+
+
 def groups(scenario: Scenario, rows: LinkRows) -> list[Group]:
     """Return the groups of agents that (54) has to be evaluated for."""
     network = scenario.network
-    if network.delay[0] != 1.0:
-        raise UsageError("method 'simplified' is derived without delay (thesis 4.2); network.delay must be 0")
+    require_prompt(network)
     steps = range(1, network.steps + 1)
     require_memoryless(
         rows,
@@ -179,10 +231,7 @@ def groups(scenario: Scenario, rows: LinkRows) -> list[Group]:
     )
     shared = scenario.correlation == "shared"
     if len(scenario.sensors) == 1 and rows.uniform:
-        senders = number_of_senders(network.architecture, network.agents)
-        arrivals = _per_step(rows, network.steps, lambda k: like_senders(senders, rows.at_step(k)))
-        case = Case(scenario.model, scenario.sensors[0], scenario.P0, shared, arrivals, len(rows.link))
-        return [Group((tuple(range(network.agents)),), case)]
+        return [Group((tuple(range(network.agents)),), like_case(scenario, rows))]
     matrices = dict(zip(steps, _per_step(rows, network.steps, lambda k: rows.matrices(network, k)), strict=True))
     kinds = np.asarray(scenario.sensor_of)
     senders_of = possible_senders(network.architecture, network.agents)
@@ -190,6 +239,15 @@ def groups(scenario: Scenario, rows: LinkRows) -> list[Group]:
         _group(scenario, shared, np.flatnonzero(kinds == own), own, kinds[senders_of], matrices)
         for own in range(len(scenario.sensors))
     ]
+
+
+def like_case(scenario: Scenario, rows: LinkRows, noises: Noises = COMMON) -> Case:
+    """Like agents with equally likely links, and the noises of each row's own where there are any."""
+    network = scenario.network
+    senders = number_of_senders(network.architecture, network.agents)
+    arrivals = _per_step(rows, network.steps, lambda k: like_senders(senders, rows.at_step(k)))
+    shared = scenario.correlation == "shared"
+    return Case(scenario.model, scenario.sensors[0], scenario.P0, shared, arrivals, len(rows.link), noises)
 
 
 def _group(

@@ -24,8 +24,8 @@ import numpy as np
 
 from stochfuse.errors import UsageError
 from stochfuse.information import Sources
-from stochfuse.kalman import Estimate, Information, to_information
-from stochfuse.model import Filter, at_step
+from stochfuse.kalman import Estimate, Information, factor, to_information
+from stochfuse.model import Filter, Noises, at_step
 from stochfuse.quantities import Moments
 from stochfuse.scenario import Scenario
 from stochfuse.world import Footprints, World
@@ -52,24 +52,68 @@ def sources_of(scenario: Scenario, records: np.ndarray | None = None, *, by_agen
     return Sources(scenario.model, sensors, [start] * len(sensors), columns)
 
 
-def error_sources(scenario: Scenario) -> Sources:
+def error_sources(scenario: Scenario, noises: Noises | None = None) -> Sources:
     """Return the same for every agent, with noise footprints in the place of data; see `moments`.
+
+    Parameters
+    ----------
+    noises : of a batch, P0 among them, in the place of the scenario's.
 
     Raises
     ------
     UsageError
         If the initial covariance has no inverse.
     """
-    world = world_of(scenario)
+    unit, told = (scenario, scenario) if noises is None else (_unit(scenario, noises), batched(scenario, noises))
+    LQ, LR, LP = _roots(noises)
+    world = world_of(unit)
     footprints, steps, everyone = Footprints(world), range(2, world.steps + 1), range(world.agents)
-    starts = [_start(scenario, footprints.start(rows)) for rows in world.states]
+    starts = [_start(told, _in_units(LP, footprints.start(rows))) for rows in world.states]
     # all agents see one process noise, so that the first agent's rows are everyone's
-    moved = [footprints.process(step, world.states[0]) for step in steps]
-    inputs = np.stack([np.zeros((scenario.model.dimension, footprints.columns)), *moved])
+    moved = [_in_units(LQ, footprints.process(step, world.states[0])) for step in steps]
+    inputs = np.stack(np.broadcast_arrays(np.zeros((scenario.model.dimension, footprints.columns)), *moved))
     nothing = [np.zeros((H.shape[-2], footprints.columns)) for H in world.H]
-    records = [nothing, *([footprints.measured(step, agent) for agent in everyone] for step in steps)]
-    sensors = [scenario.sensors[kind] for kind in scenario.sensor_of]
-    return Sources(replace(scenario.model, Bu=inputs), sensors, starts, records)
+    measured = ([_in_units(LR, footprints.measured(step, agent)) for agent in everyone] for step in steps)
+    sensors = [told.sensors[kind] for kind in told.sensor_of]
+    return Sources(replace(told.model, Bu=inputs), sensors, starts, [nothing, *measured])
+
+
+def batched(scenario: Scenario, noises: Noises) -> Scenario:
+    """Return the scenario with the noises of a batch in the place of its own: for the numbers only.
+
+    P0 is then of shape (items, d, d) and, where the noises have them, Q of (steps, items, d, d) and R of
+    (steps, items, p, p).
+    """
+    steps, (Q, R, P0) = scenario.network.steps, noises
+    model, sensors = scenario.model, scenario.sensors
+    return replace(
+        scenario,
+        model=model if Q is None else replace(model, Q=np.broadcast_to(Q, (steps, *Q.shape))),
+        sensors=sensors if R is None else tuple(replace(s, R=np.broadcast_to(R, (steps, *R.shape))) for s in sensors),
+        P0=scenario.P0 if P0 is None else P0,
+    )
+
+
+def _unit(scenario: Scenario, noises: Noises) -> Scenario:
+    """Return the scenario with unit noises in the place of a batch's."""
+    units = (None if M is None else np.eye(M.shape[-1]) for M in noises)
+    return batched(scenario, Noises(*units))
+
+
+def _roots(noises: Noises | None) -> tuple[np.ndarray | None, ...]:
+    """Square roots of the noises of a batch, None where there are none."""
+    Q, R, P0 = noises or Noises()
+    # correlations of measurement noises are those of this very root's units, see `World.joint_noise`
+    root = None if R is None else np.linalg.cholesky(R)
+    return None if Q is None else factor(Q), root, None if P0 is None else factor(P0)
+
+
+def _in_units(root: np.ndarray | None, footprint: np.ndarray) -> np.ndarray:
+    """Footprint of unit noises in units of a batch's: (..., rows, columns), the last of them the known error."""
+    if root is None:
+        return footprint
+    noises = root @ footprint[:, :-1]
+    return np.concatenate([noises, np.broadcast_to(footprint[:, -1:], (*noises.shape[:-1], 1))], axis=-1)
 
 
 def world_of(scenario: Scenario) -> World:

@@ -9,6 +9,7 @@ import os
 import re
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -39,9 +40,22 @@ def execute(command, folder):
     return done.stdout.strip("\n")
 
 
+def files(folder):
+    """Write the files that the README shows, whose first line is their name in a comment."""
+    text = README.read_text(encoding="utf-8")
+    for content, name in re.findall(r"```toml\n(# (\S+\.toml)\n.*?)```", text, re.DOTALL):
+        (folder / name).write_text(content)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return files(tmp_path_factory.mktemp("readme"))
+
+
 @pytest.mark.parametrize(("command", "output"), shown(), ids=[c for c, _ in shown()])
-def test_console_examples(command, output, tmp_path):
-    assert execute(command, tmp_path) == output
+def test_console_examples(command, output, folder):
+    assert execute(command, folder) == output
 
 
 def test_python_example(tmp_path):
@@ -51,7 +65,7 @@ def test_python_example(tmp_path):
 
 
 def test_scenario_example_is_valid(tmp_path):
-    (text,) = re.findall(r"```toml\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+    (text,) = re.findall(r"```toml\n(?!# trade)(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
     (tmp_path / "mine.toml").write_text(text)
     assert "ok: 3 agents with 2 kinds of sensors" in execute("stochfuse scenario check mine.toml", tmp_path)
     assert "RMS of position [m]" in execute("stochfuse predict mine.toml --metric rms:position", tmp_path)
@@ -68,10 +82,12 @@ def rewrite():
     def fill(match):
         lines = []
         for command, _ in commands(match.group(1)):
-            lines.append(f"$ {command}\n{execute(command, '/tmp')}".strip("\n"))
+            lines.append(f"$ {command}\n{execute(command, folder)}".strip("\n"))
         return "```console\n" + "\n\n".join(lines) + "\n```"
 
-    README.write_text(CONSOLE.sub(fill, README.read_text(encoding="utf-8")), encoding="utf-8")
+    with tempfile.TemporaryDirectory() as made:
+        folder = files(Path(made))
+        README.write_text(CONSOLE.sub(fill, README.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -337,7 +337,12 @@ def test_summary_json_is_one_object_without_nan():
     results = study([LINK, MATRICES], failed=(4,), columns=columns)
     text = json.dumps(studies.summary_json(results), allow_nan=False)
     found = json.loads(text)
-    assert (found["schema"], found["points"], found["rows"], found["failed"]) == ("stochfuse.study-summary/1", 33, 97, 1)
+    assert (found["schema"], found["points"], found["rows"], found["failed"]) == (
+        "stochfuse.study-summary/1",
+        33,
+        97,
+        1,
+    )
     assert found["axes"][1]["values"][1] == [[1.0, 0.5], [0.5, 1.0]]
     assert found["columns"]["claimed.trace"]["least"]["keys"]["model.Q"] == [[1.0, 0.0], [0.0, 1.0]]
     assert set(found["columns"]["claimed.trace.standard_error"]) == {"label"}  # nothing was sampled

@@ -58,11 +58,14 @@ class Carried(NamedTuple):
 class Filter(NamedTuple):
     """What an agent that loses nothing would compute.
 
+    One filter for all rows of link probabilities, or one for each: then noises have an axis of rows, see
+    `stochfuse.sources.batched`, and so has what is carried, after that of the paths.
+
     Parameters
     ----------
     model : state transition and process noise.
     sensors : sensor of each kind of agent.
-    P0 : covariance of one initial estimate.
+    P0 : covariance of one initial estimate, (d, d) or (rows, d, d).
     shared : whether all agents start from one common estimate.
     error : (d, 1) initial error that all agents share, or None.
     """
@@ -75,9 +78,9 @@ class Filter(NamedTuple):
 
     def start(self, counts: np.ndarray) -> Carried:
         """Estimate from so many agents' initial ones, and what it leaves of the error."""
-        x = np.zeros((len(self.P0), 1)) if self.error is None else self.error
+        x = np.zeros((self.model.dimension, 1)) if self.error is None else self.error
         P = (self.P0 if self.shared else self.P0 / counts.sum())[None]
-        return Carried(x[None], P if self.scalar else factor(P))
+        return Carried(np.broadcast_to(x, (*P.shape[:-1], 1)), P if self.scalar else factor(P))
 
     def after(self, before: Carried, counts: np.ndarray, step: int) -> Carried:
         """Predict to a step and take in the measurements of so many agents of each kind; of errors, if there are.
@@ -193,12 +196,27 @@ def expected_optimum(given: Filter, contacts: Contacts, steps: int, rows: int) -
     TooManyPathsError
         If there are more than `MOST_PATHS`.
     """
-    found = [_paths(given, contacts, steps, some) for some in blocks_of_rows(contacts, rows)]
+    return joined([over_paths(given, contacts, steps, some) for some in blocks_of_rows(contacts, rows)])
+
+
+def joined(found: Sequence[tuple[list[np.ndarray], int]]) -> Chain:
+    """Return what `over_paths` found for all blocks of rows."""
     P, b, M = (np.concatenate([moments[m] for moments, _ in found]) for m in range(3))
     return Chain(P, b, M, np.zeros(P.shape[:2]), found[0][1])
 
 
-def _paths(given: Filter, contacts: Contacts, steps: int, some: slice) -> tuple[list[np.ndarray], int]:
+def over_paths(given: Filter, contacts: Contacts, steps: int, some: slice) -> tuple[list[np.ndarray], int]:
+    """E[P], E[b] and E[P + b bᵀ] of some rows, each (rows, steps, groups, …), and the number of paths.
+
+    Parameters
+    ----------
+    given : one filter for all rows, or one for each of these.
+
+    Raises
+    ------
+    TooManyPathsError
+        If there are more than `MOST_PATHS`.
+    """
     counts, states = by_counts(contacts)
     classes: dict[int, Class] = {}
     out: list[list[np.ndarray]] = [[], [], []]
@@ -229,6 +247,8 @@ def _closed(
 
 
 def _over(weight: np.ndarray, values: np.ndarray) -> np.ndarray:
+    if values.ndim == 4:  # a filter for each row
+        return np.einsum("rgp,prij->rgij", weight, values)
     return np.tensordot(weight, values, axes=1)
 
 

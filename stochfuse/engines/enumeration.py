@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from decimal import Decimal
 from itertools import combinations
 from typing import Any, NamedTuple, cast
 
@@ -38,6 +39,8 @@ LONG = 1000
 """States from which on the work is long enough to be announced before."""
 CHUNK = 1 << 21
 """Numbers per matrix entry that are worked on at a time."""
+WRITTEN_OUT = 10**30
+"""Numbers from which on only the size is told."""
 
 
 class View(NamedTuple):
@@ -232,27 +235,32 @@ def _expected(sizes: list[int], candidates: int, relabellings: int) -> int:
 
 
 def _extrapolated(sizes: list[int], expected: int, further: int) -> int:
-    return round(expected * (expected / sizes[-1]) ** max(0, further))
+    return round(expected * (Decimal(expected) / sizes[-1]) ** max(0, further))
 
 
 def _check_exchange(drawn: list[Event], options: int, number: int, request: Request) -> None:
     if options ** len(drawn) > MOST_CELLS >> 4:
         raise TooManyError(
-            f"one exchange of {request.agents} agents has {float(options) ** len(drawn):.3g} outcomes, the whole "
-            f"{number:.3g}, "
-            "too many to list: use --method optimal or --method monte-carlo, fewer steps or fewer agents"
+            f"one exchange of {request.agents} agents has {_shown(options ** len(drawn))} outcomes, the "
+            f"whole {_shown(number)}, too many to list: use --method optimal or --method monte-carlo, fewer steps or "
+            "fewer agents"
         )
 
 
 def _check_size(expected: int, number: int, request: Request) -> None:
     if expected > request.most and not request.prune:
         raise TooManyError(
-            f"{number:.3g} outcomes make about {expected} different graphs, more than --max-graphs "
+            f"{_shown(number)} outcomes make about {_shown(expected, '')} different graphs, more than --max-graphs "
             f"{request.most}: raise it, "
             "leave the least likely out with --prune, or use --method optimal or --method monte-carlo, fewer "
             "steps or fewer "
             "agents"
         )
+
+
+def _shown(number: int, short: str = ".3g") -> str:
+    """Return a number in words' length, also one that is too large for a floating-point number."""
+    return f"{number:{short}}" if number < WRITTEN_OUT else f"{Decimal(number):.3g}"
 
 
 def _ending(

@@ -6,7 +6,8 @@ prior, and so m arrivals make one Kalman update with m + 1 measurements (`stochf
 
 A *form* is one way to carry the recursion numerically: `MeasurementSpace` (scalar models included), `SquareRoot` where
 the former would cancel, and `Outcomes` for unlike agents.  An *item* is one column of the batch: a row of link
-probabilities, or such a row for one receiver where receivers differ.
+probabilities, or such a row for one receiver where receivers differ.  Items may have noises Q, R and P(k0) of their own
+(`Case.noises`): what depends on them is then an array over the items where it is a number or a constant matrix else.
 """
 
 from __future__ import annotations
@@ -19,7 +20,16 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from stochfuse.arrivals import Arrivals
-from stochfuse.averaged import prior_map, smallest_pivot, triangle, update_measurement_space, update_scalar
+from stochfuse.averaged import (
+    noise_factor,
+    prior_map,
+    smallest_pivot,
+    solve_lower,
+    triangle,
+    update_measurement_space,
+    update_scalar,
+    upper,
+)
 from stochfuse.kalman import (
     Information,
     factor,
@@ -29,7 +39,7 @@ from stochfuse.kalman import (
     update_factor,
     update_information,
 )
-from stochfuse.model import Model, Sensor, at_step
+from stochfuse.model import Model, Noises, Sensor, at_step
 
 CANCELLATION = 1e-5
 """Share of prior variance left by an update, below which the square-root form takes over: 1e-16/1e-5 of an entry."""
@@ -43,6 +53,9 @@ ELEMENTS = 4_000_000
 PRECISE = 1e4
 """Information gained in one step, relative to the prior's, above which unlike agents' updates go through an SVD."""
 
+
+COMMON = Noises()
+"""No item has a noise of its own."""
 
 _TINY = 1e-300
 
@@ -93,6 +106,7 @@ class Case:
     shared : whether all agents start from one common estimate.
     arrivals : distribution of the number of messages at each step.
     items : number of items.
+    noises : each item's own noises, at all steps, in the place of those of the model, the sensor and P0.
     """
 
     model: Model
@@ -101,6 +115,7 @@ class Case:
     shared: bool
     arrivals: Sequence[Arrivals]
     items: int
+    noises: Noises = COMMON
 
     def first_share(self) -> np.ndarray:
         """Share of P0 that the exchange at step 1 leaves, shape (items,): E[1/(m+1)], or 1 for one shared estimate."""
@@ -111,7 +126,12 @@ class Case:
         chosen: dict[int, Arrivals] = {}
         for a in self.arrivals:
             chosen.setdefault(id(a), a.take(items))
-        return replace(self, arrivals=[chosen[id(a)] for a in self.arrivals], items=len(np.arange(self.items)[items]))
+        return replace(
+            self,
+            arrivals=[chosen[id(a)] for a in self.arrivals],
+            items=len(np.arange(self.items)[items]),
+            noises=self.noises.take(items),
+        )
 
 
 class MeasurementSpace:
@@ -119,17 +139,22 @@ class MeasurementSpace:
 
     def __init__(self, case: Case):
         self.case = case
+        self._own = None if case.noises.Q is None and case.noises.R is None else _OwnNoises(case)
 
     def start(self) -> Carried:
-        rows, columns, _ = triangle(self.case.model.dimension)
-        P = self.case.P0[rows, columns][:, None] * self.case.first_share()
-        return Carried(P, np.ones(self.case.items))
+        P0 = self.case.noises.P0
+        P = upper(self.case.P0[None] if P0 is None else P0) * self.case.first_share()
+        return Carried(P, np.ones(self.case.items) if self._own is None else self._own.left)
 
     def advance(self, carried: Carried, step: int) -> Carried:
         model, sensor = self.case.model, self.case.sensor
-        matrix, constant, J = _prior_map(model, sensor, step if model.varies or sensor.varies else 2)
-        prior = matrix @ carried.value
-        prior += constant
+        at, C_inv = step if model.varies or sensor.varies else 2, None
+        if self._own is None:
+            matrix, constant, J = _prior_map(model, sensor, at)
+            prior = matrix @ carried.value
+            prior += constant
+        else:
+            prior, J, C_inv = self._own.prior(carried.value, at), self._own.information(at), self._own.C_inv
         d, arrivals = model.dimension, self.case.arrivals[step - 1]
         if d == 1:
             return Carried(update_scalar(prior, J, arrivals), carried.left)
@@ -137,7 +162,7 @@ class MeasurementSpace:
         peak = carried.peak
         if peak is None or step % 8 == 0:
             peak = prior[diagonal] if peak is None else np.maximum(peak, prior[diagonal])
-        P, left = update_measurement_space(prior, d, sensor.H.shape[-2], arrivals)
+        P, left = update_measurement_space(prior, d, sensor.H.shape[-2], arrivals, C_inv)
         left = np.minimum(carried.left, left)
         # digits are lost by degrees, too: to a variance far below its peak, or over many steps in a nearly singular P
         last = step == len(self.case.arrivals)
@@ -151,8 +176,44 @@ class MeasurementSpace:
         return np.take(carried.value, triangle(self.case.model.dimension)[2], axis=0, out=out, mode="clip")
 
     def carry(self, P: np.ndarray) -> Carried:
-        rows, columns, _ = triangle(self.case.model.dimension)
-        return Carried(np.ascontiguousarray(P[:, rows, columns].T), np.ones(len(P)))
+        return Carried(upper(P), np.ones(len(P)) if self._own is None else self._own.left)
+
+
+class _OwnNoises:
+    """Noises of the items' own in `MeasurementSpace`: laid out once for all steps.
+
+    H is common to all items, so that the matrices remain common too.  What depends on Q is added between them, what
+    depends on R comes after them.
+    """
+
+    def __init__(self, case: Case):
+        self._case = case
+        self._Q = None if case.noises.Q is None else upper(case.noises.Q)
+        self._C, self._J = None, None
+        self.C_inv, self.left = None, np.ones(case.items)
+        if case.noises.R is not None:
+            self._C, self.left = noise_factor(case.noises.R)
+            self.C_inv = solve_lower(self._C, np.eye(len(self._C))[..., None])
+
+    def prior(self, P: np.ndarray, step: int) -> np.ndarray:
+        """Rows of `prior_map`, (rows, items); those of A P⁻ and A P⁻Aᵀ with H for A where C is an item's own."""
+        case = self._case
+        moves, added, measures = _prior_parts(case.model, case.sensor, step, self._C is None)
+        n = len(moves)
+        rows = np.empty((n + len(measures), P.shape[1]))
+        np.matmul(moves, P, out=rows[:n])
+        rows[:n] += added if self._Q is None else self._Q
+        np.matmul(measures, rows[:n], out=rows[n:])
+        return rows
+
+    def information(self, step: int) -> np.ndarray | float:
+        """HᵀR⁻¹H of a scalar state; of others it is not needed."""
+        model, sensor = self._case.model, self._case.sensor
+        if self._C is None or model.dimension > 1:
+            return _prior_map(model, sensor, step)[2]
+        if self._J is None or sensor.H.ndim > 2:
+            self._J = (solve_lower(self._C, at_step(sensor.H, step)[..., None]) ** 2).sum(axis=(0, 1))
+        return self._J
 
 
 @lru_cache(maxsize=1024)
@@ -165,21 +226,56 @@ def _prior_map(model: Model, sensor: Sensor, step: int) -> tuple[np.ndarray, np.
     return matrix[:rows], constant[:rows], float(np.vdot(whitened, whitened))
 
 
+@lru_cache(maxsize=1024)
+def _prior_parts(model: Model, sensor: Sensor, step: int, whiten: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`prior_map` in two: what moves P to P⁻ and adds Q, and what takes P⁻ to A P⁻ and A P⁻Aᵀ, A = C⁻¹H or H."""
+    F, Q, A = (at_step(M, step) for M in (model.F, model.Q, sensor.H))
+    if whiten:
+        A = np.linalg.solve(np.linalg.cholesky(at_step(sensor.R, step)), A)
+    d = model.dimension
+    n = d * (d + 1) // 2
+    matrix, constant = prior_map(F, Q, A)
+    measures = prior_map(np.eye(d), np.zeros_like(Q), A)[0][n:]
+    return matrix[:n], constant[:n], measures[:0] if d == 1 else measures
+
+
 class SquareRoot:
-    """Factors L of P = L Lᵀ, shape (items, d, d)."""
+    """Factors L of P = L Lᵀ, shape (items, d, d).
+
+    What it rounds goes through `factor`, `rounded` and `noise`, which `stochfuse.engines.rounding` replaces.
+    """
 
     def __init__(self, case: Case):
         self.case = case
 
+    def factor(self, P: np.ndarray) -> np.ndarray:
+        """Square root of a given covariance."""
+        return factor(P)
+
+    def rounded(self, L: np.ndarray) -> np.ndarray:
+        """Return a factor that has been computed."""
+        return L
+
+    def noise(self, R: np.ndarray) -> np.ndarray:
+        """Return a given noise covariance, which is about to be factored."""
+        return R
+
     def start(self) -> Carried:
-        share = np.sqrt(self.case.first_share())
-        return Carried(factor(self.case.P0) * share[:, None, None], np.ones(self.case.items))
+        share, P0 = np.sqrt(self.case.first_share()), self.case.noises.P0
+        return Carried(self.factor(self.case.P0 if P0 is None else P0) * share[:, None, None], np.ones(self.case.items))
 
     def advance(self, carried: Carried, step: int) -> Carried:
         model, sensor, arrivals = self.case.model, self.case.sensor, self.case.arrivals[step - 1]
-        prior = predict_factor(carried.value, at_step(model.F, step), factor(at_step(model.Q, step)))
-        L = update_factor(prior, at_step(sensor.H, step), at_step(sensor.R, step), lambda s: arrivals.remaining(s.T).T)
-        return Carried(L, carried.left)
+        Q, R, _ = self.case.noises
+        Q = self.factor(at_step(model.Q, step) if Q is None else Q)
+        R = self.noise(at_step(sensor.R, step) if R is None else R)
+        prior = self.rounded(predict_factor(self.rounded(carried.value), at_step(model.F, step), Q))
+
+        def shrink(s: np.ndarray) -> np.ndarray:
+            # a ratio beyond floating point would leave nothing, whatever R is
+            return arrivals.remaining(np.where(np.isfinite(s), s, np.nan).T).T
+
+        return Carried(update_factor(prior, at_step(sensor.H, step), R, shrink), carried.left)
 
     def covariance(self, carried: Carried, out: np.ndarray | None = None) -> np.ndarray:
         return _from_factors(carried.value, out)
@@ -286,25 +382,27 @@ def run(form: Form, steps: int, out: np.ndarray) -> np.ndarray:
     return carried.left
 
 
-def run_like(case: Case, steps: int) -> tuple[np.ndarray, np.ndarray]:
+def run_like(case: Case, steps: int, out: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Run like agents in measurement space, and again in square-root form where that cancels.
 
     Returns
     -------
-    covariance : (steps, d, d, items).
+    covariance : (steps, d, d, items), `out` if that is given; not finite where it grows beyond floating point.
     cancelled : (items,) whether the square-root form was needed.
     """
     d = case.model.dimension
-    covariances, left = np.empty((steps, d, d, case.items)), np.empty(case.items)
+    covariances = np.empty((steps, d, d, case.items)) if out is None else out
+    left = np.empty(case.items)
     with np.errstate(all="ignore"):
         for first in range(0, case.items, BLOCK):
             block = np.s_[first : first + BLOCK]
             part = case if case.items <= BLOCK else case.take(block)
             left[block] = run(MeasurementSpace(part), steps, covariances[..., block])
-    cancelled = ~(left > CANCELLATION) | ~np.isfinite(covariances[-1]).all(axis=(0, 1))
-    if cancelled.any():
+        cancelled = ~(left > CANCELLATION) | ~np.isfinite(covariances[-1]).all(axis=(0, 1))
         again = np.flatnonzero(cancelled)
-        redone = np.empty((steps, d, d, len(again)))
-        run(SquareRoot(case.take(again)), steps, redone)
-        covariances[..., again] = redone
+        for first in range(0, len(again), BLOCK):
+            some = again[first : first + BLOCK]
+            redone = np.empty((steps, d, d, len(some)))
+            run(SquareRoot(case.take(some)), steps, redone)
+            covariances[..., some] = redone
     return covariances, cancelled

@@ -43,7 +43,7 @@ def draw_pareto(found: ParetoFront, results: Results) -> Any:
     """Return the figure that `plot_pareto` writes."""
     figure = figure_class()(figsize=(7.5, 5.6), layout="constrained")
     axes = figure.add_subplot()
-    one_in = -(-results.plan.size // MOST_DRAWN)
+    one_in = -(-found.compared // MOST_DRAWN)
     load, accuracy = _all(found, results, one_in)
     for which, values in (("x", np.append(load, found.load)), ("y", np.append(accuracy, found.accuracy))):
         axes.set(**{f"{which}scale": "log" if wide(values) else "linear"})
