@@ -78,14 +78,18 @@ def noise_factor(R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     -------
     C : (p, p, items), lower triangular.
     left : (items,) smallest conditional variance of a noise given those before it, relative to its variance: about
-        log10(1/left) digits are lost where C⁻¹ is applied to what has been rounded.
+        log10(1/left) digits are lost where C⁻¹ is applied to what has been rounded.  Not positive, or NaN, where R is
+        singular to rounding.
     """
-    items, p = R.shape[:2]
-    if p == 1:
-        return np.sqrt(R.T), np.ones(items)
-    C = np.ascontiguousarray(np.moveaxis(np.linalg.cholesky(R), 0, -1))
-    pivots, variances = (np.diagonal(M) for M in (C, np.moveaxis(R, 0, -1)))
-    return C, (pivots**2 / variances).min(axis=1)
+    C, left = np.zeros((*R.shape[1:], len(R))), np.ones(len(R))
+    with np.errstate(all="ignore"):
+        for i in range(len(C)):
+            pivot = R[:, i, i] - (C[i, :i] ** 2).sum(axis=0)
+            left = np.minimum(left, pivot / R[:, i, i])
+            C[i, i] = np.sqrt(pivot)
+            for j in range(i + 1, len(C)):
+                C[j, i] = (R[:, j, i] - (C[j, :i] * C[i, :i]).sum(axis=0)) / C[i, i]
+    return C, left
 
 
 def solve_lower(C: np.ndarray, B: np.ndarray) -> np.ndarray:

@@ -156,17 +156,18 @@ def forms_used(cancelled: np.ndarray) -> set[str]:
 
 def faults(P: np.ndarray) -> dict[int, str]:
     """Why covariances (steps, d, d, items) are none, per item where one is not: the first step and what is wrong."""
+    # what is not finite stays so; what an update takes too much of shows in a variance, or is there at the last step
+    fine = sound(P[-1]) & (np.diagonal(P, axis1=1, axis2=2) >= 0).all(axis=(0, 2))
     found: dict[int, str] = {}
-    for step in range(len(P), 0, -1):
-        now = np.moveaxis(P[step - 1], -1, 0)
-        suspects = np.flatnonzero(~sound(P[step - 1]))
-        finite = np.isfinite(now[suspects]).all(axis=(1, 2))
-        lost = f"the covariance at step {step} is not finite: it grows beyond floating point"
-        found |= dict.fromkeys(suspects[~finite].tolist(), lost)
-        for item in suspects[finite]:
-            fault = covariance_fault(now[item])
+    for item in np.flatnonzero(~fine):
+        for step, now in enumerate(P[..., item], start=1):
+            if not np.isfinite(now).all():
+                found[int(item)] = f"the covariance at step {step} is not finite: it grows beyond floating point"
+                break
+            fault = covariance_fault(now)
             if fault is not None:
                 found[int(item)] = f"expected a covariance at step {step}, got {fault}"
+                break
     return found
 
 

@@ -107,6 +107,24 @@ WORDS = (
     "[" * 200 + "]" * 200, "[[agent]]", "[vary]", "[model]", '"\\ud800"', '"\\u0000"', "\ufeff", "\r", "\t",
     "\n[" + ".".join("a" * 600) + "]\n", "\nnetwork" + ".steps" * 400 + " = 1\n",
 )  # fmt: skip
+NUMBERS = (
+    "0",
+    "1",
+    "2",
+    "3",
+    "-1",
+    "0.5",
+    "1.5",
+    "-0.0",
+    "1e-12",
+    "1e12",
+    "1e-300",
+    "1e100",
+    "7",
+    "[1, 2]",
+    "[[2]]",
+    "[0.5, 0.5]",
+)
 VALUES: tuple[Any, ...] = (
     None, True, False, 0, 1, 2, -1, 3, 7, 0.5, -0.0, 1.5, 1e-300, 1e100, -1e100, 1e150, 5e-324, math.nan, math.inf,
     -math.inf, 2**31, 2**63, 10**30, 10**400, 16**5000, "", "x", "1", "trace", "det", "std:x", "rms:x1,x2", "var:",
@@ -130,12 +148,12 @@ KEYS = (
 
 
 def mutated_text(pick: random.Random, text: str) -> str:
-    """The text after one to four changes of lines and characters."""
-    for _ in range(pick.randint(1, 4)):
+    """The text after one to three changes of lines and characters."""
+    for _ in range(pick.choice((1, 1, 2, 3))):
         lines = text.splitlines(keepends=True) or [""]
         i, j = pick.randrange(len(lines)), pick.randrange(len(lines))
         at = pick.randrange(len(text) + 1)
-        match pick.randrange(10):
+        match pick.choice((0, 1, 2, 3, 4, 5, 6, 7, 7, 7, 8, 8, 8, 8)):
             case 0:
                 lines[i : i + pick.randint(1, 3)] = []
             case 1:
@@ -153,14 +171,19 @@ def mutated_text(pick: random.Random, text: str) -> str:
                     text[:at] + chr(pick.choice((pick.randrange(128), pick.randrange(0x2100)))) + text[at + 1 :],
                     [],
                 )
-            case 7 | 8:
+            case 7:
                 # what is right of an equals sign, the likeliest to be read and wrong
-                lines[i] = re.sub(r"=.*", lambda _: f"= {pick.choice(WORDS)}", lines[i])
+                lines[i] = re.sub(r"=.*", lambda _: f"= {pick.choice(pick.choice((NUMBERS, WORDS)))}", lines[i])
             case _:
                 numbers = list(re.finditer(r"\d+(\.\d+)?", text))
                 if numbers:
                     found = pick.choice(numbers)
-                    text, lines = text[: found.start()] + pick.choice(WORDS) + text[found.end() :], []
+                    text, lines = (
+                        text[: found.start()]
+                        + pick.choice(pick.choice((NUMBERS, NUMBERS, WORDS)))
+                        + text[found.end() :],
+                        [],
+                    )
         text = "".join(lines) if lines else text
     return text
 
@@ -174,7 +197,7 @@ def places(value: Any) -> list[tuple[Any, Any]]:
 def mutated_mapping(pick: random.Random, mapping: dict[str, Any]) -> dict[str, Any]:
     """The mapping after one to three changes of keys and values."""
     mapping = copy.deepcopy(mapping)
-    for _ in range(pick.randint(1, 3)):
+    for _ in range(pick.choice((1, 1, 1, 2, 3))):
         entries = places(mapping)
         if not entries:
             break
@@ -190,7 +213,7 @@ def mutated_mapping(pick: random.Random, mapping: dict[str, Any]) -> dict[str, A
                 container[pick.choice(KEYS)] = copy.deepcopy(pick.choice(VALUES))
             case 3:
                 container[key] = [container[key]] * pick.randint(0, 3)
-            case 4 if isinstance(container[key], int | float):
+            case 4 if isinstance(container[key], float):
                 container[key] = pick.choice((-1, 0.0, 1e-200, 1e60, 0.5, 1 - 1e-16)) * (1 + container[key])
             case 5:
                 other, place = pick.choice(entries)
@@ -319,11 +342,11 @@ def test_deep_nesting_is_refused(kind, place):
         deep = {"a": deep} if kind == "table" else [deep]
     mapping = tomllib.loads(PRESETS["thesis-transient"])
     mapping["model"][place] = deep
-    with pytest.raises(sf.ScenarioError, match="nested too deeply|model"):
+    with pytest.raises(sf.ScenarioError, match=r"nested too deeply|model"):
         sf.Scenario.from_mapping(mapping)
-    with pytest.raises(sf.ScenarioError, match="nested too deeply|vary|model"):
+    with pytest.raises(sf.ScenarioError, match=r"nested too deeply|vary|model"):
         load_study({"scenario": mapping, "vary": {"network.link": [0.5]}})
-    with pytest.raises(sf.ScenarioError, match="nested too deeply|vary|model"):
+    with pytest.raises(sf.ScenarioError, match=r"nested too deeply|vary|model"):
         load_study({"vary": {"model": {place: deep}}})
 
 
@@ -357,7 +380,7 @@ def test_links_of_many_agents_are_not_laid_out():
 
 NO_STUDY = [
     ({".": [1]}, r"vary\.\."),
-    ({"agent.²": [1]}, r"vary\.agent\.²"),
+    ({"agent.²": [1]}, "agent: expected a list"),
     ({f"agent[{'1' * 5000}].R": [1]}, "vary"),
     ({"model.R": [1, 10**30, 10**400]}, r"vary\.model\.R"),
     ({"model.R": [1.0, 10**400]}, r"vary\.model\.R"),

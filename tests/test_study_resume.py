@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import random
 import re
@@ -18,6 +19,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import stochfuse as sf
+from stochfuse.cli import main
 from stochfuse.studies import plan as plans
 from stochfuse.studies import running
 
@@ -34,20 +36,22 @@ P = 1.0
 agents = 3
 steps = 3
 """
-# fifteen chunks of four points, each a twentieth of a second
+# fifteen chunks of four points, each some hundredths of a second
 SAMPLED = f"""{SCENARIO}
 [vary]
 "network.link" = {{ from = 0, to = 1, number = 10 }}
 "model.R" = [1.0, 2.0, 0.0, 4.0, 5.0, 6.0]
 [predict]
 method = "monte-carlo"
-runs = 200
+runs = 100
 """
 # quick to work out, and long to write
 LARGE = f"""{SCENARIO}
 [vary]
 "network.link" = {{ from = 0, to = 1, number = 30000 }}
 """
+
+STUDIES = {"sampled": SAMPLED, "large": LARGE}
 
 
 def command(study: Path, *options: str) -> list[str]:
@@ -114,46 +118,75 @@ def quiet(tmp_path_factory):
     """The results of uninterrupted runs, by study and ending."""
     folder = tmp_path_factory.mktemp("quiet")
     found = {}
-    for name, text, suffix in [
-        ("sampled", SAMPLED, ".csv"),
-        ("sampled", SAMPLED, ".parquet"),
-        ("large", LARGE, ".csv"),
-    ]:
+    for name, suffix in itertools.product(STUDIES, (".csv", ".parquet")):
         study = folder / f"{name}.toml"
-        study.write_text(text)
+        study.write_text(STUDIES[name])
         began = time.monotonic()
         sf.study(study, study.with_suffix(suffix))
         found[name, suffix] = (content(study.with_suffix(suffix)), time.monotonic() - began)
     return found
 
 
+def the_command(arguments: list[str], log: str) -> None:
+    """Be the command: what a process forked for it does."""
+    os.setsid()
+    with open(log, "w") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    sys.argv = ["stochfuse", "study", *arguments]
+    main()
+
+
+def launch(forked, study: Path, arguments: list[str], log: Path):
+    """Start the command: a fork that has read the libraries already, or a process from nothing."""
+    if forked is None:
+        with log.open("w") as file:
+            return subprocess.Popen(command(study, *arguments), stdout=file, stderr=file)
+    process = forked(target=the_command, args=([str(study), *arguments], str(log)))
+    process.start()
+    return process
+
+
+@pytest.fixture(scope="module")
+def forked():
+    """Processes that have read the libraries already: there are more kills in a minute."""
+    context = get_context("forkserver")
+    context.set_forkserver_preload(["stochfuse.cli.study", "stochfuse.studies.running", "pyarrow.parquet"])
+    warm = context.Process(target=int)
+    warm.start()
+    warm.join()
+    return context.Process
+
+
 ROUNDS = [
-    ("sampled", SAMPLED, ".csv", "1"),
-    ("sampled", SAMPLED, ".parquet", "1"),
-    ("sampled", SAMPLED, ".parquet", "2"),
-    ("large", LARGE, ".csv", "1"),
+    ("sampled", ".csv", "1", 6),
+    ("sampled", ".parquet", "1", 5),
+    ("sampled", ".parquet", "2", 4),
+    ("large", ".csv", "1", 5),
 ]
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "suffix", "workers"), ROUNDS, ids=lambda value: value if len(value) < 9 else ""
-)
-def test_five_kills_at_random_moments(name, text, suffix, workers, tmp_path, quiet):
+@pytest.mark.parametrize(("name", "suffix", "workers", "rounds"), ROUNDS)
+def test_kills_at_random_moments(name, suffix, workers, rounds, tmp_path, quiet, forked):
     expected, seconds = quiet[name, suffix]
-    study, output = tmp_path / "mine.toml", tmp_path / f"mine{suffix}"
-    study.write_text(text)
+    study, output, log = tmp_path / "mine.toml", tmp_path / f"mine{suffix}", tmp_path / "log"
+    study.write_text(STUDIES[name])
     moment = random.Random(f"{name}{suffix}{workers}")
+    arguments = ["-o", str(output), "--workers", workers]
+    folder = output.with_name(f"{output.name}.parts")
+    log.touch()
     kept: dict[str, bytes] = {}
-    for _ in range(5):
-        process = start(study, "-o", str(output), "--workers", workers)
-        # it has begun when it has taken the lock; then any moment of what it would still do
-        lock = output.with_name(f"{output.name}.parts") / "lock"
-        assert wait_until(lambda lock=lock: lock.exists() or output.exists(), 30), process.communicate()
-        time.sleep(moment.uniform(0.0, 0.4 + 0.3 * seconds))
+    for _ in range(rounds):
+        process = launch(forked if workers == "1" else None, study, arguments, log)
+        if moment.random() < 0.7:
+            # most of the time it begins, and little of what is of interest happens
+            assert wait_until(lambda: folder.exists() or output.exists(), 30), log.read_text()
+        time.sleep(moment.uniform(0.0, 0.5 * seconds + (int(workers) - 1)))
         theirs = descendants(process.pid)
         process.kill()
-        process.communicate()
+        wait_until(lambda process=process: not alive(process.pid), 10)
         assert wait_until(lambda theirs=theirs: not any(map(alive, theirs)), 10), "workers stay behind"
+        assert "Traceback" not in log.read_text()
         found = parts(output)
         assert output.exists() or kept.items() <= found.items()
         kept = found
@@ -161,7 +194,8 @@ def test_five_kills_at_random_moments(name, text, suffix, workers, tmp_path, qui
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
     assert content(output) == expected
-    assert sorted(path.name for path in tmp_path.iterdir()) == [output.name, f"{output.name}.study.json", "mine.toml"]
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["log", output.name, f"{output.name}.study.json", "mine.toml"]
 
 
 @pytest.mark.parametrize("workers", ["1", "2"])
@@ -177,7 +211,7 @@ def test_ctrl_c_ends_it_and_says_what_is_kept(workers, tmp_path, quiet):
     assert out == ""
     assert err.splitlines()[-2:] == [f"note: {AGAIN}", "interrupted"]
     assert "Traceback" not in err
-    assert not any(map(alive, theirs))
+    assert wait_until(lambda: not any(map(alive, theirs)), 10)
     assert parts(output)
     again = sf.study(study, output, workers=int(workers))
     assert content(output) == quiet["sampled", ".csv"][0]
@@ -207,17 +241,15 @@ def test_two_commands_at_once(tmp_path, quiet):
     assert content(output) == quiet["sampled", ".csv"][0]
 
 
-WIDE = LARGE.replace("30000", "20000")
-LIMITS = {"a part": 100_000, "the result": 500_000}
+LIMITS = {"a part": 100_000, "the result": 600_000}
 """Bytes that a file may have: the first part has more; all parts have less, and the result more."""
 
 
-@pytest.mark.parametrize("limit", LIMITS)
-@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_a_file_that_may_not_grow(suffix, limit, tmp_path):
+@pytest.mark.parametrize(("suffix", "limit"), [(".csv", "a part"), (".csv", "the result"), (".parquet", "the result")])
+def test_a_file_that_may_not_grow(suffix, limit, tmp_path, quiet):
     """The system refuses writes inside pyarrow and csv alike, as a full disk does."""
     study, output = tmp_path / "mine.toml", tmp_path / f"mine{suffix}"
-    study.write_text(WIDE)
+    study.write_text(LARGE)
     most = LIMITS[limit]
     done = subprocess.run(
         command(study, "-o", str(output)),
@@ -232,13 +264,11 @@ def test_a_file_that_may_not_grow(suffix, limit, tmp_path):
     assert not output.exists()
     assert len(parts(output)) == (0 if limit == "a part" else 2)
     sf.study(study, output)
-    quiet_one = tmp_path / f"quiet{suffix}"
-    sf.study(study, quiet_one)
-    assert content(output) == content(quiet_one)
+    assert content(output) == quiet["large", suffix][0]
 
 
 SMALL_DISK = """
-mount -t tmpfs -o size=700k none disk && cp mine.toml disk && cd disk || exit 99
+mount -t tmpfs -o size=1400k none disk && cp mine.toml disk && cd disk || exit 99
 {command} -o mine{suffix}
 echo "exit $?, $(ls -A mine{suffix}.parts | wc -l) files"
 mount -o remount,size=64m . && {command} -o mine{suffix} >&2 && cp mine{suffix} ..
@@ -250,9 +280,9 @@ mount -o remount,size=64m . && {command} -o mine{suffix} >&2 && cp mine{suffix} 
     reason="no disk can be mounted here",
 )
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_a_disk_that_is_full(suffix, tmp_path):
+def test_a_disk_that_is_full(suffix, tmp_path, quiet):
     study = tmp_path / "mine.toml"
-    study.write_text(WIDE)
+    study.write_text(LARGE)
     (tmp_path / "disk").mkdir()
     script = SMALL_DISK.format(command=f"{sys.executable} -m stochfuse study mine.toml", suffix=suffix)
     done = subprocess.run(
@@ -261,8 +291,7 @@ def test_a_disk_that_is_full(suffix, tmp_path):
     # lock, record and both parts stay
     assert done.stdout == "exit 2, 4 files\n", done.stderr
     assert re.match(f"error: cannot write mine{suffix}: .*No space left on device.*; {AGAIN}\n", done.stderr)
-    sf.study(study, tmp_path / f"quiet{suffix}")
-    assert content(tmp_path / f"mine{suffix}") == content(tmp_path / f"quiet{suffix}")
+    assert content(tmp_path / f"mine{suffix}") == quiet["large", suffix][0]
 
 
 FEW = {
@@ -328,10 +357,14 @@ def test_a_chunk_that_kills_its_worker_every_time_is_named(tmp_path, few, monkey
     output = tmp_path / "few.csv"
     with monkeypatch.context() as patched:
         patched.setattr(running, "ProcessPoolExecutor", Handing(dies_at_the_end, ProcessPoolExecutor))
-        with pytest.raises(sf.StochfuseError, match=rf"a worker died at points 20 to 23 or near them \(.*\); {AGAIN}"):
+        patched.setattr(running, "ATTEMPTS", 2)
+        with pytest.raises(
+            sf.StochfuseError, match=rf"a worker died at points (16 to 19|20 to 23) or near them \(.*\); {AGAIN}"
+        ):
             sf.study(FEW, output, workers=2)
     kept = parts(output)
-    assert set(kept) == {f"part-{chunk:08d}" for chunk in range(5)}
+    # at most the one that was at work beside it is missing
+    assert set(kept) >= {f"part-{chunk:08d}" for chunk in range(4)}
     sf.study(FEW, output)
     assert output.read_bytes() == few
 
@@ -346,9 +379,12 @@ def test_a_worker_that_dies_once_is_replaced(tmp_path, few, monkeypatch):
 
 def test_a_given_executor_that_breaks_is_not_mended(tmp_path, few):
     output = tmp_path / "few.csv"
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        with pytest.raises(sf.StochfuseError, match=rf"a worker died at points \d+ to \d+ or near them .*; {AGAIN}"):
-            sf.study(FEW, output, executor=Handing(dies_at_the_end, pool))  # type: ignore[arg-type]
+    message = rf"a worker died at points \d+ to \d+ or near them .*; {AGAIN}"
+    with (
+        ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool,
+        pytest.raises(sf.StochfuseError, match=message),
+    ):
+        sf.study(FEW, output, executor=Handing(dies_at_the_end, pool))  # type: ignore[arg-type]
     sf.study(FEW, output)
     assert output.read_bytes() == few
 
@@ -364,7 +400,7 @@ def fails(record: str, chunk: int) -> tuple[bytes, dict[str, str]]:
 @pytest.mark.parametrize(
     ("function", "message"),
     [
-        (other_software, r"workers: expected the same software as here, got numpy 1\.0 instead of"),
+        (other_software, r"workers: expected the same software as here, got .*numpy 1\.0 instead of"),
         (fails, rf"a worker failed \(RuntimeError: no such thing\); {AGAIN}"),
     ],
 )
@@ -390,7 +426,7 @@ def cluster():
             processes=True,
             threads_per_worker=1,
             host="127.0.0.1",
-            dashboard_address=None,
+            dashboard_address=":0",
             silence_logs=50,
         ) as cluster,
     ):
@@ -440,15 +476,21 @@ def test_a_dask_scheduler_that_does_not_answer(tmp_path):
     study = tmp_path / "mine.toml"
     study.write_text(SAMPLED)
     began = time.monotonic()
-    done = subprocess.run(command(study, "--dask", "tcp://127.0.0.1:9"), capture_output=True, text=True, check=False)
-    assert time.monotonic() - began < 20
+    impatient = "import stochfuse.cli.study as s; s.PATIENCE = 2; from stochfuse.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", impatient, "study", str(study), "--dask", "tcp://127.0.0.1:9"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert time.monotonic() - began < 15
     assert done.returncode == 2
     assert "error: --dask tcp://127.0.0.1:9: expected a Dask scheduler that answers, got" in done.stderr
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "mine.parquet.parts").exists()
 
 
-@pytest.mark.parametrize("address", ["nonsense", "tcp://", "ftp://127.0.0.1:8786", "tcp://127.0.0.1:port"])
+@pytest.mark.parametrize("address", ["nonsense", "ftp://127.0.0.1:port"])
 def test_what_is_no_address(address, tmp_path):
     study = tmp_path / "mine.toml"
     study.write_text(SAMPLED)
@@ -463,7 +505,7 @@ def test_a_dask_cluster_without_workers(tmp_path):
 
     study = tmp_path / "mine.toml"
     study.write_text(SAMPLED)
-    with LocalCluster(n_workers=0, host="127.0.0.1", dashboard_address=None, silence_logs=50) as empty:
+    with LocalCluster(n_workers=0, host="127.0.0.1", dashboard_address=":0", silence_logs=50) as empty:
         address = empty.scheduler_address
         done = subprocess.run(command(study, "--dask", address), capture_output=True, text=True, check=False)
     assert done.returncode == 2

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stochfuse import simplified
+from stochfuse.averaged import noise_factor
 from stochfuse.engines.mean_field import BLOCK, Case, run_like
 from stochfuse.engines.rounding import definite, lost, rounding
 from stochfuse.errors import UsageError
@@ -19,6 +20,8 @@ from stochfuse.model import Noises
 from stochfuse.network import default_rows, require_memoryless, uniform_rows
 from stochfuse.scenario import Scenario, require_independent_noise, require_one_state
 
+DOUBTFUL = 1e-10
+"""Smallest pivot of R, relative to its variance, below which it takes a library's word that there is a factor."""
 WHO = "a batch of the simplified formulation"
 
 
@@ -95,7 +98,10 @@ def _factorable(noises: Noises) -> tuple[Noises, dict[int, str]]:
     """Noises of which every R has a Cholesky factor, and why those have no answer that are there for others."""
     if noises.R is None:
         return noises, {}
-    usable = definite(noises.R)
+    left = noise_factor(noises.R)[1]
+    usable = left > 0
+    doubtful = np.flatnonzero(usable & (left < DOUBTFUL))
+    usable[doubtful] = definite(noises.R[doubtful])
     if usable.all():
         return noises, {}
     why = "R: expected a positive definite matrix, got one that is singular to rounding"

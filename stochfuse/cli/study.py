@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Iterator
@@ -80,6 +81,8 @@ def study(
     The result has one row per point and step. Killed at any moment, the same command goes on where it stopped; when it
     is finished, it shows what there is. Example: stochfuse study trade.toml --workers 2 --plot trade.png
     """
+    # one thread in matrix products, before NumPy is there: these are small, and workers have a processor each
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from stochfuse.cli.options import check_files
     from stochfuse.errors import UsageError
     from stochfuse.studies.running import result_path

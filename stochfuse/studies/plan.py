@@ -265,7 +265,7 @@ def _resolved(name: str, mapping: Mapping[str, Any], folder: Path) -> Plan:
     record = {
         "name": Path(name).name,
         "scenario_name": scenario_name,
-        "study": _plain({**resolved, "scenario": base}),
+        "study": _plain(name, {**resolved, "scenario": base}),
         "software": software(),
     }
     return _built(record, name)
@@ -278,9 +278,12 @@ def plan_of(record: str) -> Plan:
     return _built(loaded, loaded["name"])
 
 
-def _plain(value: Any) -> Any:
+def _plain(name: str, value: Any) -> Any:
     """Return what JSON gives back of a mapping: dates as text."""
-    return json.loads(json.dumps(value, default=str))
+    try:
+        return json.loads(json.dumps(value, default=str))
+    except ValueError:
+        raise ScenarioError(name, "a number has too many digits") from None
 
 
 def _built(record: Mapping[str, Any], name: str) -> Plan:

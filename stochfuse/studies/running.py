@@ -37,8 +37,6 @@ WAITING = 3
 """Chunks that are handed out for each worker: enough to keep it busy, few enough to hold little."""
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 AGAIN = "finished points are kept: the same command goes on"
-ATTEMPTS = 3
-"""How often a chunk is handed out whose worker dies."""
 
 
 class Progress:
@@ -145,25 +143,31 @@ def _work(
             journal.commit(chunk, packed(evaluate(plan, plan.range_of(chunk))))
             progress.advance(len(plan.range_of(chunk)))
         return
-    record, attempts = json.dumps(plan.record), dict.fromkeys(todo, 0)
-    while todo:
-        with _executor(executor, workers) as (using, width):
-            try:
-                for chunk, data in _answered(using, width, record, todo):
+    pending, suspects, deadly = dict.fromkeys(todo), [], []
+    while pending:
+        alone = bool(suspects)
+        handed = suspects[:1] if alone else list(pending)
+        try:
+            with _executor(executor, 1 if alone else workers) as (using, width):
+                for chunk, data in _answered(using, width, json.dumps(plan.record), handed):
                     journal.commit(chunk, data)
-                    attempts.pop(chunk)
+                    pending.pop(chunk)
                     progress.advance(len(plan.range_of(chunk)))
-            except BrokenExecutor as error:
-                # whoever was at work may be to blame; a chunk that is there every time is
-                for chunk in list(attempts)[:width]:
-                    attempts[chunk] += 1
-                    if executor is not None or attempts[chunk] >= ATTEMPTS:
-                        points = plan.range_of(chunk)
-                        raise StochfuseError(
-                            f"a worker died at points {points.start} to {points.stop - 1} or near them "
-                            f"({error or 'no reason given'}); {AGAIN}"
-                        ) from None
-        todo = list(attempts)
+            suspects = suspects[1:]
+        except BrokenExecutor as error:
+            if executor is not None:
+                raise StochfuseError(f"a worker died ({error or 'no reason given'}); {AGAIN}") from None
+            if alone:  # its worker had nothing else to do
+                deadly.append(suspects.pop(0))
+                pending.pop(deadly[-1])
+            else:
+                suspects = list(pending)[:workers]
+    if deadly:
+        points = plan.range_of(deadly[0])
+        raise StochfuseError(
+            f"a worker died at points {points.start} to {points.stop - 1}, again when it was alone with them; all "
+            "others are kept"
+        )
 
 
 def _answered(executor: Executor, width: int, record: str, todo: Iterable[int]) -> Iterator[tuple[int, bytes]]:
@@ -201,7 +205,8 @@ def _checked(future: Future[tuple[bytes, dict[str, str]]]) -> bytes:
         raise StochfuseError(f"a worker failed ({reason}); {AGAIN}") from None
     ours = software()
     if theirs != ours:
-        different = ", ".join(f"{name} {theirs.get(name)} instead of {ours[name]}" for name in ours)
+        unlike = [name for name in ours if theirs.get(name) != ours[name]]
+        different = ", ".join(f"{name} {theirs.get(name)} instead of {ours[name]}" for name in unlike)
         raise UsageError(f"workers: expected the same software as here, got {different}")
     return data
 
