@@ -25,7 +25,7 @@ INDEFINITE = -1e-9
 def shown(value: Any) -> str:
     """Return a value as it came, cut to a readable length."""
     try:
-        text = repr(value)
+        text = repr(value.tolist() if isinstance(value, np.ndarray) else value)
     except (RecursionError, ValueError):
         return "something too large to show"
     return text if len(text) <= 60 else text[:57] + "..."
@@ -132,6 +132,9 @@ class Checker:
         if array is None:
             return None
         kind = f"a symmetric positive {'definite' if definite else 'semi-definite'} matrix"
+        if array.shape[-1] != array.shape[-2]:
+            self.note(path, kind, f"a {size(array.shape[-2:])} matrix")
+            return None
         fault = covariance_fault(array, definite=definite)
         if fault is not None:
             self.note(path, kind, fault)

@@ -41,7 +41,7 @@ class UsageError(StochfuseError, ValueError):
     """A request that does not fit the scenario or the method."""
 
 
-class NotABatch(UsageError):  # noqa: N818
+class NotABatchError(UsageError):
     """Scenarios that cannot be evaluated together, or not by this method; one by one they may have answers."""
 
 

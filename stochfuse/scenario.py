@@ -248,6 +248,8 @@ def read_file(source: str | Path, missing: str = "no such file") -> tuple[str, s
         raise ScenarioError(str(path), f"not a text file in UTF-8 (byte {error.start})") from None
     except OSError as error:
         raise ScenarioError(str(path), f"cannot be read: {error.strerror}") from None
+    except ValueError:
+        raise ScenarioError(shown(str(path)), "no name that a file can have") from None
 
 
 def parse(name: str, text: str) -> dict[str, Any]:
@@ -390,7 +392,8 @@ def _relations(
     check: Checker, mapping: Mapping[str, Any], model: Model | None, network: Network | None, own: bool
 ) -> Mapping[tuple[int, int], Relation]:
     """What agents measure of each other."""
-    tables = [table for table in mapping.get("agent") or [] if isinstance(table, dict)]
+    agents = mapping.get("agent")
+    tables = [table for table in agents if isinstance(table, dict)] if isinstance(agents, list) else []
     if "cooperative" not in mapping and not any("position" in table for table in tables):
         if own:
             check.note("cooperative", "what agents with states of their own measure of each other", "nothing")

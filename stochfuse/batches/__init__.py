@@ -12,7 +12,7 @@ import numpy as np
 
 from stochfuse.batches import general, optimum, simplified
 from stochfuse.checks import covariance_fault
-from stochfuse.errors import NotABatch
+from stochfuse.errors import NotABatchError
 from stochfuse.methods import LFG, MOST_GRAPHS, group_of
 from stochfuse.model import Noises
 from stochfuse.prediction import Prediction
@@ -71,13 +71,13 @@ def predict(
 
     Raises
     ------
-    NotABatch
+    NotABatchError
         If the method makes no batch of them.
     StochfuseError
         If some item has no answer and it is not known which.
     """
     if settings.get("prune"):
-        raise NotABatch("a batch: expected every outcome, got prune")
+        raise NotABatchError("a batch: expected every outcome, got prune")
     ways = {q: "optimal" if q == "optimal" else method for q in quantities}
     found = {}
     for way in dict.fromkeys(ways.values()):
@@ -95,7 +95,9 @@ def _found(
     errors = bool(set(quantities) - {"claimed", "optimal"})
     if method == "simplified":
         if errors:
-            raise NotABatch(f"a batch by method simplified: expected quantity claimed, got {', '.join(quantities)}")
+            raise NotABatchError(
+                f"a batch by method simplified: expected quantity claimed, got {', '.join(quantities)}"
+            )
         P, _, faults = simplified.covariances(scenario, link, noises)
         everyone = np.zeros(scenario.network.agents, dtype=int)
         return _Found(Moments(P[:, :, None]), everyone, "broadcast-prior", _natures(len(link), "approximate"), faults)
@@ -111,7 +113,7 @@ def _found(
         natures = np.where(every.rounding > EXACT, "approximate", "exact")
         faults = {int(i): rounded(every.rounding[i]) for i in np.flatnonzero(every.rounding > WORTHLESS)}
     else:
-        raise NotABatch(f"a batch: expected method simplified, general, naive or optimal, got {method}")
+        raise NotABatchError(f"a batch: expected method simplified, general, naive or optimal, got {method}")
     return _Found(of, group_of(groups), estimator, natures, {**_faults(of), **faults})
 
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.batches.claims import Claims, Key, Step, claims_of
-from stochfuse.errors import NotABatch
+from stochfuse.errors import NotABatchError
 from stochfuse.information import Sources, estimated, evaluate_atoms, unpacked
 from stochfuse.kalman import Estimate
 from stochfuse.model import Noises
@@ -71,7 +71,7 @@ def moments(
 
     Raises
     ------
-    NotABatch
+    NotABatchError
         If they cannot be evaluated together: another estimator, links that differ or are bursty, unlike sensors with
         noises R of their own, a number that is not finite.
     UsageError, NoAnswerError
@@ -79,9 +79,11 @@ def moments(
     """
     check_batch(scenario, link, noises)
     if estimator not in SUMS:
-        raise NotABatch(f"a batch by method general: expected estimator {', '.join(SUMS)}, got '{estimator}'")
+        raise NotABatchError(f"a batch by method general: expected estimator {', '.join(SUMS)}, got '{estimator}'")
     if errors and noises.R is not None and scenario.noise is not None and scenario.noise.disturbance is not None:
-        raise NotABatch("a batch of actual errors with noises R of their own: expected no noise.disturbance, got one")
+        raise NotABatchError(
+            "a batch of actual errors with noises R of their own: expected no noise.disturbance, got one"
+        )
     noises = with_starts(scenario, noises, len(link))
     # what the estimator does not take it says of any item
     first = Noises(*(None if M is None else M[0] for M in noises))
@@ -95,19 +97,23 @@ def moments(
     back = np.argsort(order)
     joined = [None if m[0] is None else np.concatenate(m)[back] for m in zip(*parts, strict=True)]
     if not all(m is None or np.isfinite(m).all() for m in joined):
-        raise NotABatch("a batch by method general: expected finite moments, got one that is not")
+        raise NotABatchError("a batch by method general: expected finite moments, got one that is not")
     return Found(Moments(*joined), claims.groups, np.concatenate(rounding)[back], claims.states, claims.outcomes)
 
 
 def check_batch(scenario: Scenario, link: np.ndarray, noises: Noises) -> None:
-    """Raise NotABatch if scenarios cannot be told apart by one link probability and common noises each."""
+    """Raise NotABatchError if scenarios cannot be told apart by one link probability and common noises each."""
     network = scenario.network
     if link.ndim != 1:
-        raise NotABatch(f"a batch: expected one link probability for each item, got an array of shape {link.shape}")
+        raise NotABatchError(
+            f"a batch: expected one link probability for each item, got an array of shape {link.shape}"
+        )
     if network.burst is not None or any(burst is not None for burst in network.case_bursts):
-        raise NotABatch("a batch: expected links without memory, got network.burst")
+        raise NotABatchError("a batch: expected links without memory, got network.burst")
     if noises.R is not None and len(scenario.sensors) > 1:
-        raise NotABatch("a batch with noises R of their own: expected like sensors, got unlike ones ([[agent]] H, R)")
+        raise NotABatchError(
+            "a batch with noises R of their own: expected like sensors, got unlike ones ([[agent]] H, R)"
+        )
 
 
 def with_starts(scenario: Scenario, noises: Noises, items: int) -> Noises:

@@ -16,7 +16,7 @@ from stochfuse.batches.claims import Key, typical_rows
 from stochfuse.batches.general import check_batch, with_starts
 from stochfuse.engines.contact_chain import Filter, TooManyPathsError, by_counts, check_size, joined, over_paths
 from stochfuse.engines.contacts import Contacts, contacts, number_of_paths
-from stochfuse.errors import NotABatch
+from stochfuse.errors import NotABatchError
 from stochfuse.model import Model, Noises, Sensor
 from stochfuse.network import restricted, uniform_rows
 from stochfuse.optimum import counted, filter_of, groups_of
@@ -57,7 +57,7 @@ def moments(scenario: Scenario, link: np.ndarray, noises: Noises, *, errors: boo
 
     Raises
     ------
-    NotABatch
+    NotABatchError
         If they cannot be evaluated together: links that differ or are bursty, unlike sensors with noises R of their
         own, more paths than can be gone through one by one, a number that is not finite.
     UsageError
@@ -75,7 +75,7 @@ def moments(scenario: Scenario, link: np.ndarray, noises: Noises, *, errors: boo
     given = (filter_of(batched(scenario, noises.take(some))) for some in blocks)
     found = joined([over_paths(f, chain, network.steps, some) for f, some in zip(given, blocks, strict=True)])
     if not np.isfinite(found.P).all():
-        raise NotABatch("a batch by method optimal: expected a finite optimum, got one that is not")
+        raise NotABatchError("a batch by method optimal: expected a finite optimum, got one that is not")
     of = Moments(found.P, found.P, found.bias, found.square) if errors else Moments(found.P)
     return Found(of, groups, paths, found.bound)
 
@@ -86,7 +86,7 @@ def _number_of_paths(key: Key, groups: tuple[tuple[int, ...], ...]) -> int:
 
     Raises
     ------
-    NotABatch
+    NotABatchError
         If they are too many.
     """
     network, kinds = key.scenario.network, key.scenario.sensor_of
@@ -99,7 +99,7 @@ def _number_of_paths(key: Key, groups: tuple[tuple[int, ...], ...]) -> int:
         simplest = Filter(Model(one, one, 0 * one, ("x",), ("",)), [Sensor(one, one)] * len(set(kinds)), one, False)
         return over_paths(simplest, contacts(network, rows, kinds, groups), network.steps, slice(0, 1))[1]
     except TooManyPathsError as reason:
-        raise NotABatch(f"a batch by method optimal: {reason}") from None
+        raise NotABatchError(f"a batch by method optimal: {reason}") from None
 
 
 def _items(chain: Contacts, paths: int, dimension: int) -> int:

@@ -27,6 +27,7 @@ from stochfuse.report.table import Table, number, to_csv
 from stochfuse.studies.pareto import ParetoFront
 
 if TYPE_CHECKING:
+    from stochfuse.studies.plan import Plan
     from stochfuse.studies.results import Results
 
 SCHEMA = "stochfuse.study-summary/1"
@@ -211,7 +212,7 @@ def pareto_titles(found: ParetoFront, results: Results) -> tuple[str, ...]:
     plan = results.plan
     natures = ", ".join(sorted(set(found.nature.tolist())))
     when = "each point's last step" if found.step is None else f"step {found.step}"
-    fixed = "".join(f", {name} = {shortened(value)}" for name, value in found.fixed.items())
+    fixed = "".join(f", {name} = {shortened(value)}" for name, value in _fixed(found, plan).items())
     return (
         f"Study {plan.name}: accuracy against message load; no point does better in both than {_these(found)}",
         f"Scenario {plan.scenario_name}; {whose(plan)}; {counted(found.compared, 'point')} compared{fixed}, "
@@ -230,11 +231,12 @@ def _these(found: ParetoFront) -> str:
 def pareto_table(found: ParetoFront, results: Results, digits: int = 5) -> Table:
     """Return the front by rising load, with the keys of its points, under what is compared."""
     how = _how(found)
-    words = [words_of(axis.values) for axis in results.plan.axes]
+    told = _fixed(found, results.plan)
+    shown_keys = {a.name: words_of(a.values) for a in results.plan.axes if a.name not in told}
     errors = np.full(len(found.points), np.nan) if found.error is None else found.error
     rows = []
     for i, (load, accuracy, error) in enumerate(zip(found.load, found.accuracy, errors, strict=True)):
-        cells = [shortened(found.keys[key][i], known) for key, known in zip(found.keys, words, strict=True)]
+        cells = [shortened(found.keys[key][i], known) for key, known in shown_keys.items()]
         sampled = f" ±{error:.2g}" if np.isfinite(error) else ""
         shown = number(float(load), digits) if load else "0"
         rows.append(
@@ -246,7 +248,13 @@ def pareto_table(found: ParetoFront, results: Results, digits: int = 5) -> Table
                 *(str(h[i]) for h in how.values()),
             )
         )
-    return Table(pareto_titles(found, results), ("point",), ("load", "accuracy", *found.keys, *how), tuple(rows))
+    return Table(pareto_titles(found, results), ("point",), ("load", "accuracy", *shown_keys, *how), tuple(rows))
+
+
+def _fixed(found: ParetoFront, plan: Plan) -> dict[str, Any]:
+    """Keys that have one value at all points compared, and that value."""
+    single = {axis.name: axis.values[0] for axis in plan.axes if axis.values and len(set(axis.values)) == 1}
+    return {**single, **found.fixed}
 
 
 def _how(found: ParetoFront) -> dict[str, np.ndarray]:

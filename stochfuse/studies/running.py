@@ -36,6 +36,8 @@ from stochfuse.studies.writing import check_format, packed, unpacked, write_resu
 WAITING = 3
 """Chunks that are handed out for each worker: enough to keep it busy, few enough to hold little."""
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+MOST_DEADLY = 3
+"""Chunks that kill their worker, after which the study stops."""
 AGAIN = "finished points are kept: the same command goes on"
 
 
@@ -160,13 +162,17 @@ def _work(
             if alone:  # its worker had nothing else to do
                 deadly.append(suspects.pop(0))
                 pending.pop(deadly[-1])
+                if len(deadly) == MOST_DEADLY:
+                    break
             else:
                 suspects = list(pending)[:workers]
     if deadly:
-        points = plan.range_of(deadly[0])
+        points, hint = plan.range_of(deadly[0]), ""
+        if len(deadly) == MOST_DEADLY:
+            hint = f", and {MOST_DEADLY - 1} times more: does the script that starts workers say if __name__ == '__main__'?"
         raise StochfuseError(
-            f"a worker died at points {points.start} to {points.stop - 1}, again when it was alone with them; all "
-            "others are kept"
+            f"a worker died at points {points.start} to {points.stop - 1}, again when it was alone with them{hint}; "
+            "what is finished is kept"
         )
 
 

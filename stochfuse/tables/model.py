@@ -38,7 +38,8 @@ def read_network(check: Checker, table: Mapping[str, Any]) -> Network | None:
         if case.get("burst") is not None:
             bursty = _burst(check, f"network.case[{i}]", case)
             own = own if bursty is None else mean_delivery(bursty)
-        name = str(case.get("name", i))
+        given_name = case.get("name", i)
+        name = given_name if isinstance(given_name, str) else str(i)
         check.name(f"network.case[{i}].name", name)
         if name in [other for other, _ in cases]:
             check.note(f"network.case[{i}].name", "a name of its own", shown(name))
@@ -171,7 +172,8 @@ def _names(check: Checker, path: str, value: Any, d: int | None) -> tuple[str, .
         return None
     if len(value) != d:
         check.note(path, f"{d} names, one per state", f"{len(value)}")
-    elif path.endswith("states") and len(set(value)) < d:
+        return None
+    if path.endswith("states") and len(set(value)) < d:
         check.note(path, "different names", shown(value))
     for i, name in enumerate(value, start=1):
         check.name(f"{path}[{i}]", str(name), of_state=path.endswith("states"))
