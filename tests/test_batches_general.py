@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import stochfuse as sf
 from stochfuse.batches import claims, general, optimum
-from stochfuse.errors import NotABatch
+from stochfuse.errors import NotABatchError
 from stochfuse.model import Noises
 from stochfuse.quantities import matrix
 from tests import strategies
@@ -283,7 +283,7 @@ def disturbed():
     ],
 )  # fmt: skip
 def test_what_is_no_batch(call, message):
-    with pytest.raises(NotABatch, match=message):
+    with pytest.raises(NotABatchError, match=message):
         call(Noises(R=np.linspace(1, 2, ITEMS)[:, None, None]))
 
 
@@ -300,7 +300,7 @@ def test_numbers_beyond_floating_point():
     made["model"]["F"] = 1e10
     scenario = sf.Scenario.from_mapping(made)
     noises = Noises(Q=np.array([1.0, 1e308])[:, None, None], R=np.full((2, 1, 1), 1e307), P0=np.full((2, 1, 1), 1e300))
-    with np.errstate(all="ignore"), pytest.raises(NotABatch, match="expected a finite optimum, got one that is not"):
+    with np.errstate(all="ignore"), pytest.raises(NotABatchError, match="expected a finite optimum, got one that is not"):
         optimum.moments(scenario, np.array([0.5, 0.5]), noises)
 
 

@@ -184,7 +184,7 @@ def test_kills_at_random_moments(name, suffix, workers, rounds, tmp_path, quiet,
         time.sleep(moment.uniform(0.0, 0.5 * seconds + (int(workers) - 1)))
         theirs = descendants(process.pid)
         process.kill()
-        wait_until(lambda process=process: not alive(process.pid), 10)
+        (process.join if workers == "1" else process.wait)()
         assert wait_until(lambda theirs=theirs: not any(map(alive, theirs)), 10), "workers stay behind"
         assert "Traceback" not in log.read_text()
         found = parts(output)
@@ -355,16 +355,12 @@ class Handing:
 
 def test_a_chunk_that_kills_its_worker_every_time_is_named(tmp_path, few, monkeypatch):
     output = tmp_path / "few.csv"
+    message = "^a worker died at points 20 to 23, again when it was alone with them; all others are kept$"
     with monkeypatch.context() as patched:
         patched.setattr(running, "ProcessPoolExecutor", Handing(dies_at_the_end, ProcessPoolExecutor))
-        patched.setattr(running, "ATTEMPTS", 2)
-        with pytest.raises(
-            sf.StochfuseError, match=rf"a worker died at points (16 to 19|20 to 23) or near them \(.*\); {AGAIN}"
-        ):
+        with pytest.raises(sf.StochfuseError, match=message):
             sf.study(FEW, output, workers=2)
-    kept = parts(output)
-    # at most the one that was at work beside it is missing
-    assert set(kept) >= {f"part-{chunk:08d}" for chunk in range(4)}
+    assert set(parts(output)) == {f"part-{chunk:08d}" for chunk in range(5)}
     sf.study(FEW, output)
     assert output.read_bytes() == few
 
@@ -379,7 +375,7 @@ def test_a_worker_that_dies_once_is_replaced(tmp_path, few, monkeypatch):
 
 def test_a_given_executor_that_breaks_is_not_mended(tmp_path, few):
     output = tmp_path / "few.csv"
-    message = rf"a worker died at points \d+ to \d+ or near them .*; {AGAIN}"
+    message = rf"^a worker died \(.*\); {AGAIN}$"
     with (
         ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool,
         pytest.raises(sf.StochfuseError, match=message),
@@ -400,7 +396,7 @@ def fails(record: str, chunk: int) -> tuple[bytes, dict[str, str]]:
 @pytest.mark.parametrize(
     ("function", "message"),
     [
-        (other_software, r"workers: expected the same software as here, got .*numpy 1\.0 instead of"),
+        (other_software, r"workers: expected the same software as here, got numpy 1\.0 instead of [0-9.]+$"),
         (fails, rf"a worker failed \(RuntimeError: no such thing\); {AGAIN}"),
     ],
 )

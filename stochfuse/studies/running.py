@@ -169,7 +169,7 @@ def _work(
     if deadly:
         points, hint = plan.range_of(deadly[0]), ""
         if len(deadly) == MOST_DEADLY:
-            hint = f", and {MOST_DEADLY - 1} times more: does the script that starts workers say if __name__ == '__main__'?"
+            hint = f", and {MOST_DEADLY - 1} times more (is the script guarded by if __name__ == '__main__'?)"
         raise StochfuseError(
             f"a worker died at points {points.start} to {points.stop - 1}, again when it was alone with them{hint}; "
             "what is finished is kept"
