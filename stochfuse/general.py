@@ -12,13 +12,14 @@ is a polynomial whose coefficients are found once; with unequal µ_ij(k) every r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from stochfuse.conditioning import change, moved_claims, reach
 from stochfuse.distribution import Distribution, parse_statistic
 from stochfuse.engines import Progress
 from stochfuse.engines.enumeration import (
@@ -36,9 +37,9 @@ from stochfuse.kalman import Estimate
 from stochfuse.metrics import Metric
 from stochfuse.network import LinkRows, Network, number_of_senders, uniform_rows
 from stochfuse.quantities import Moments, linear, matrix, number, value
-from stochfuse.rules import make
+from stochfuse.rules import SUMS, make
 from stochfuse.scenario import Scenario
-from stochfuse.sources import moments
+from stochfuse.sources import error_sources, moments, sources_of
 from stochfuse.weights import Rows, bernstein, bursty, monomials, weights_for
 
 MOST_PROBABILITIES = 20_000_000

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import numpy as np
+
+from stochfuse.conditioning import change, reach, suspects_in_square_root
 from stochfuse.engines.contact_chain import Chain, Filter, TooManyPathsError, check_size, expected_optimum
 from stochfuse.engines.contacts import contacts, number_of_paths
 from stochfuse.engines.enclosure import enclosed_optimum
+from stochfuse.engines.rounding import Moving
 from stochfuse.events import relabellings
 from stochfuse.general import groups_alike
+from stochfuse.model import Noises
 from stochfuse.network import LinkRows
 from stochfuse.scenario import Scenario, require_independent_noise, require_one_state
 
@@ -25,13 +32,39 @@ def optimum(scenario: Scenario, rows: LinkRows) -> tuple[Chain, tuple[tuple[int,
     groups = groups_of(scenario, rows)
     chain, given = contacts(network, rows, scenario.sensor_of, groups), filter_of(scenario)
     plain = counted(scenario, rows)
+
+    def every_path(given: Filter) -> Chain:
+        return expected_optimum(given, chain, network.steps, len(rows.link))
+
+    def bounds(given: Filter) -> Chain:
+        return enclosed_optimum(given, chain, network.steps, len(rows.link))
+
+    go = every_path
     try:
         if plain:
             check_size(number_of_paths(network))
-        found = expected_optimum(given, chain, network.steps, len(rows.link))
+        found = every_path(given)
     except TooManyPathsError:
-        found = enclosed_optimum(given, chain, network.steps, len(rows.link))
+        found, go = bounds(given), bounds
+    if suspects_in_square_root(scenario, Noises(P0=scenario.P0[None])).any():
+        found = found._replace(rounding=float(rounding(given, found, go).max()))
     return found._replace(paths=number_of_paths(network)) if plain else found, groups
+
+
+def rounding(given: Filter, found: Chain, go: Callable[[Filter], Chain]) -> np.ndarray:
+    """How far rounding may reach in each row's optimum at some step, (rows,).
+
+    Parameters
+    ----------
+    go : finds the optimum of a filter.
+    """
+
+    def again(seed: int) -> np.ndarray:
+        moved = go(given._replace(numbers=Moving(seed)))
+        pairs = [(found.P, moved.P), (found.square, moved.square)]
+        return np.max([change(P, M).max(axis=(1, 2)) for P, M in pairs if P is not None and M is not None], axis=0)
+
+    return np.broadcast_to(reach(again), len(found.P))
 
 
 def groups_of(scenario: Scenario, rows: LinkRows) -> tuple[tuple[int, ...], ...]:

@@ -400,3 +400,22 @@ def test_files_of_others_are_left_alone(tmp_path):
         file.write("more\n")
     with pytest.raises(sf.UsageError, match=r"r\.csv is not the result of .*: the file has been changed since"):
         sf.study(asked(), tmp_path / "r.csv")
+
+
+def test_a_point_without_an_answer_does_not_take_its_batch_along(monkeypatch):
+    sizes = []
+
+    def spy(scenario, link, noises, *arguments, **settings):
+        sizes.append(len(link))
+        return found(scenario, link, noises, *arguments, **settings)
+
+    found = batches.predict
+    monkeypatch.setattr(evaluation.batches, "predict", spy)
+    variances = [float(P) for P in range(1, 33)]
+    variances[5] = 0.0  # the Local Fusion Graph needs its inverse
+    vary = {"network.link": [0.5], "network.steps": [2], "initial.P": variances}
+    plan = load_study(asked(vary, predict={"method": "general"}))
+    answers = evaluation.evaluate(plan, range(plan.size))
+    assert list(answers.errors) == [5]
+    assert "initial.P: expected an invertible covariance" in answers.errors[5]
+    assert sizes == [32, 16, 8, 4, 4, 2, 1, 1, 2, 8, 16]

@@ -9,6 +9,7 @@ import shutil
 import tempfile
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import pyarrow.parquet as pq
@@ -367,7 +368,7 @@ def small_chunks(monkeypatch):
     monkeypatch.setitem(plans.CHUNK, "simplified", 5)
 
 
-def rows(path: Path) -> list[dict[str, object]]:
+def rows(path: Path) -> list[dict[Any, Any]]:
     if path.suffix == ".parquet":
         return pq.read_table(path).to_pylist()
     with path.open(newline="") as file:
@@ -417,8 +418,9 @@ def test_a_full_disk_at_every_operation(name, stays, tmp_path, small_chunks):
     for at in range(1, len(done) + 1):
         folder = tmp_path / f"at{at}"
         folder.mkdir()
+        disk = FaultyDisk(folder, at, stays=stays)
         try:
-            with FaultyDisk(folder, at, stays=stays) as disk:
+            with disk:
                 sf.study(STUDY, folder / name)
         except sf.UsageError as error:
             message = rf"cannot write .*{re.escape(name)}[^:]*: (\[Errno 28\] )?No space left on device; {AGAIN}"

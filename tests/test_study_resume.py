@@ -14,6 +14,7 @@ import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
@@ -137,7 +138,7 @@ def the_command(arguments: list[str], log: str) -> None:
     main()
 
 
-def launch(forked, study: Path, arguments: list[str], log: Path):
+def launch(forked: Any, study: Path, arguments: list[str], log: Path) -> Any:
     """Start the command: a fork that has read the libraries already, or a process from nothing."""
     if forked is None:
         with log.open("w") as file:
@@ -408,7 +409,7 @@ def test_workers_that_are_not_as_they_should_be(function, message, tmp_path):
 @pytest.fixture(scope="module")
 def cluster():
     """Two workers, each a process, on the loopback."""
-    import dask
+    from dask import config
     from distributed import LocalCluster
 
     quiet_please = {
@@ -416,7 +417,7 @@ def cluster():
         "distributed.admin.system-monitor.gil.enabled": False,
     }
     with (
-        dask.config.set(quiet_please),
+        config.set(quiet_please),
         LocalCluster(
             n_workers=2,
             processes=True,

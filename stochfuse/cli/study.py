@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stochfuse.cli.options import DigitsOption, Format, FormatOption, write_report
+from stochfuse.cli.options import DigitsOption, Format, write_report
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -74,7 +74,9 @@ def study(
     ] = None,
     kind: Annotated[Kind, typer.Option(help="What is drawn over two keys.")] = Kind.heat,
     digits: DigitsOption = 5,
-    format: FormatOption = None,
+    format: Annotated[
+        Format | None, typer.Option("--format", "-f", help="Format of what is shown; default: table.")
+    ] = None,
 ) -> None:
     """Predict many points: a grid, a list or a Latin hypercube over scenario keys and methods.
 

@@ -20,7 +20,7 @@ Where paths are too many, `stochfuse.engines.enclosure` gives bounds.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -55,6 +55,38 @@ class Carried(NamedTuple):
     root: np.ndarray
 
 
+class Numbers(Protocol):
+    """What the square-root form's numbers go through, as in `stochfuse.engines.mean_field.SquareRoot`."""
+
+    def factor(self, P: np.ndarray) -> np.ndarray:
+        """Square root of a given covariance."""
+        ...
+
+    def rounded(self, L: np.ndarray) -> np.ndarray:
+        """Return a factor that has been computed, or another matrix with errors of rounding."""
+        ...
+
+    def noise(self, R: np.ndarray) -> np.ndarray:
+        """Return a given noise covariance, which is about to be factored."""
+        ...
+
+
+class AsTheyAre:
+    """Numbers as they are; `stochfuse.engines.rounding.Moving` moves them."""
+
+    def factor(self, P: np.ndarray) -> np.ndarray:
+        """Square root of a given covariance."""
+        return factor(P)
+
+    def rounded(self, L: np.ndarray) -> np.ndarray:
+        """Return the same."""
+        return L
+
+    def noise(self, R: np.ndarray) -> np.ndarray:
+        """Return the same."""
+        return R
+
+
 class Filter(NamedTuple):
     """What an agent that loses nothing would compute.
 
@@ -68,6 +100,7 @@ class Filter(NamedTuple):
     P0 : covariance of one initial estimate, (d, d) or (rows, d, d).
     shared : whether all agents start from one common estimate.
     error : (d, 1) initial error that all agents share, or None.
+    numbers : what the numbers go through.
     """
 
     model: Model
@@ -75,12 +108,13 @@ class Filter(NamedTuple):
     P0: np.ndarray
     shared: bool
     error: np.ndarray | None = None
+    numbers: Numbers = AsTheyAre()
 
     def start(self, counts: np.ndarray) -> Carried:
         """Estimate from so many agents' initial ones, and what it leaves of the error."""
         x = np.zeros((self.model.dimension, 1)) if self.error is None else self.error
         P = (self.P0 if self.shared else self.P0 / counts.sum())[None]
-        return Carried(np.broadcast_to(x, (*P.shape[:-1], 1)), P if self.scalar else factor(P))
+        return Carried(np.broadcast_to(x, (*P.shape[:-1], 1)), P if self.scalar else self.numbers.factor(P))
 
     def after(self, before: Carried, counts: np.ndarray, step: int) -> Carried:
         """Predict to a step and take in the measurements of so many agents of each kind; of errors, if there are.
@@ -88,7 +122,8 @@ class Filter(NamedTuple):
         Of one kind, the numbers may be a stack (..., 1) that goes with the estimate's.
         """
         F, Q = at_step(self.model.F, step), at_step(self.model.Q, step)
-        sensors = [(at_step(sensor.H, step), at_step(sensor.R, step)) for sensor in self.sensors]
+        given = self.numbers
+        sensors = [(at_step(sensor.H, step), given.noise(at_step(sensor.R, step))) for sensor in self.sensors]
         arrived = [(H, R, n) for (H, R), n in zip(sensors, np.moveaxis(counts, -1, 0), strict=True) if n.any()]
         if self.scalar:
             estimate = predict(Estimate(*before), F, Q)
@@ -97,9 +132,10 @@ class Filter(NamedTuple):
                 if J.any():
                     estimate = update(estimate, np.ones((1, 1)), 1.0 / (J * n[..., None, None]), np.zeros((1, 1)))
             return Carried(*estimate)
-        x, L = before.x, predict_factor(before.root, F, factor(Q))
+        x, L = before.x, given.rounded(predict_factor(given.rounded(before.root), F, given.factor(Q)))
         x = x if x is None else F @ x
         for H, R, n in arrived:
+            H = given.rounded(H)  # noqa: PLW2901
             L = update_factor(L, H, R, lambda s: 1.0 / (1.0 + n[..., None] * s))  # noqa: B023
             x = x if x is None else x - posterior_gain(L, H, R / n[..., None, None]) @ (H @ x)
         return Carried(x, L)
@@ -124,6 +160,7 @@ class Chain(NamedTuple):
     square : (rows, steps, groups, d, d) E[P + b bᵀ], or None.
     bound : (rows, steps) relative half-width of the enclosure; 0 where every path was gone through.
     paths : number of paths gone through, or None.
+    rounding : how far rounding may reach in the covariance, relative to the standard deviations.
     """
 
     P: np.ndarray
@@ -131,6 +168,7 @@ class Chain(NamedTuple):
     square: np.ndarray | None
     bound: np.ndarray
     paths: int | None
+    rounding: float = 0.0
 
 
 class TooManyPathsError(UsageError):

@@ -98,3 +98,10 @@ def rounding(case: Case, P: np.ndarray) -> np.ndarray:
 def lost(reach: np.ndarray) -> np.ndarray:
     """Whether more than `PROMISED` may be lost, from what `rounding` returns."""
     return ~(3.0 * reach <= PROMISED)
+
+
+class Moving(_Moved):
+    """What moves the numbers of another recursion in square-root form than the mean field's."""
+
+    def __init__(self, seed: int):
+        self._rng = np.random.default_rng(seed)

@@ -14,6 +14,7 @@ import numpy as np
 
 from stochfuse import batches
 from stochfuse.checks import LARGEST, covariance_fault
+from stochfuse.engines.enumeration import TooManyError
 from stochfuse.errors import ScenarioError, StochfuseError
 from stochfuse.messages import message_load
 from stochfuse.methods import predict_several
@@ -164,12 +165,9 @@ def _group(plan: Plan, values: Mapping[str, Any], numbers: Mapping[str, np.ndarr
         failed.errors.update(dict.fromkeys(range(size), _reason(error)))
         return failed
     group = _Group.empty(size, unit.network.steps, len(plan.columns), kind)
-    inside = np.flatnonzero(_inside(numbers, size))
-    if len(inside) and _batch(asked, unit, numbers, inside, group):
-        rest = np.setdiff1d(np.arange(size), inside)
-    else:
-        rest = np.arange(size)
-    _by_noises(asked, mapping, numbers, rest, group)
+    inside = _inside(numbers, size)
+    rest = _batch(asked, unit, numbers, np.flatnonzero(inside), group) if inside.any() else np.arange(0)
+    _by_noises(asked, mapping, numbers, np.union1d(rest, np.flatnonzero(~inside)), group)
     if MESSAGES in plan.quantities:
         _messages(asked, unit, numbers, group)
     return group
@@ -193,36 +191,42 @@ def _inside(numbers: Mapping[str, np.ndarray], size: int) -> np.ndarray:
     return fine
 
 
-def _batch(asked: _Asked, unit: Scenario, numbers: Mapping[str, np.ndarray], items: np.ndarray, group: _Group) -> bool:
-    """Evaluate items in one batch, if they make one that has an answer."""
+def _batch(
+    asked: _Asked, unit: Scenario, numbers: Mapping[str, np.ndarray], items: np.ndarray, group: _Group
+) -> np.ndarray:
+    """Evaluate items in one batch, or in as few as it takes to part those without an answer; return these."""
 
     def times(path: str, M: np.ndarray) -> np.ndarray | None:
         return numbers[path][items][:, None, None] * M if path in numbers else None
 
+    common = _common_link(unit)
     constant = all(M.ndim == 2 for M in (unit.model.Q, *(s.R for s in unit.sensors)))
-    if not constant or len(unit.sensors) != 1 or not (LINK in numbers or _one_link(unit)):
-        return False
-    link = numbers[LINK][items] if LINK in numbers else np.full(len(items), float(_link(unit)))
+    if not constant or len(unit.sensors) != 1 or (LINK not in numbers and common is None):
+        return items
+    link = numbers[LINK][items] if LINK in numbers else np.full(len(items), common)
     noises = Noises(times(Q, unit.model.Q), times(R, unit.sensors[0].R), times(P0, unit.P0))
     try:
         found = batches.predict(unit, link, noises, asked.method, asked.quantities, **asked.settings)
         _fill(asked, found.predictions, items, group)
+    except TooManyError as error:  # numbers have no say in that
+        group.errors.update(dict.fromkeys(items.tolist(), _reason(error)))
+        return items[:0]
     except Exception:
-        return False  # one by one it shows whose fault it is
+        if len(items) == 1:
+            return items
+        halves = np.array_split(items, 2)
+        return np.concatenate([_batch(asked, unit, numbers, half, group) for half in halves])
     for place, reason in found.faults.items():
         group.errors[int(items[place])] = reason
     for nature in ("exact", "approximate"):
         group.mark(items[found.natures == nature], (*_kind(asked, found.predictions)[:2], nature))
-    return True
+    return items[:0]
 
 
-def _one_link(scenario: Scenario) -> bool:
-    network = scenario.network
-    return network.link is not None and network.link.ndim == 0 and network.burst is None
-
-
-def _link(scenario: Scenario) -> Any:
-    return scenario.network.link
+def _common_link(scenario: Scenario) -> float | None:
+    """Link probability of a scenario that has one for all links and steps."""
+    link = scenario.network.link
+    return None if link is None or link.ndim or scenario.network.burst is not None else float(link)
 
 
 def _by_noises(
