@@ -252,8 +252,8 @@ def read_file(source: str | Path, missing: str = "no such file") -> tuple[str, s
         raise ScenarioError(shown(str(path)), "no name that a file can have") from None
 
 
-def parse(name: str, text: str) -> dict[str, Any]:
-    """Parse TOML, or JSON if the text begins with a brace."""
+def parse(name: str, text: str, help: str = "`stochfuse scenario new`") -> dict[str, Any]:
+    """Parse TOML, or JSON if the text begins with a brace; `help` is what an empty text's author should see."""
     try:
         if text.lstrip("\ufeff \t\r\n").startswith("{") or name.lower().endswith(".json"):
             import json
@@ -270,9 +270,9 @@ def parse(name: str, text: str) -> dict[str, Any]:
             name, f"not valid {'JSON' if 'json' in type(error).__module__ else 'TOML'}: {error}"
         ) from None
     if not isinstance(mapping, dict):
-        raise ScenarioError(name, f"expected a table with [model], [initial] and [network], got {shown(mapping)}")
+        raise ScenarioError(name, f"expected a table of keys, got {shown(mapping)}")
     if not mapping:
-        raise ScenarioError(name, "empty; see `stochfuse scenario new`")
+        raise ScenarioError(name, f"empty; see {help}")
     return mapping
 
 

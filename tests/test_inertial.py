@@ -484,7 +484,7 @@ def test_one_step_needs_no_way(preset):
         ("leg.1.duration", -30, r"navigation.leg\[2\].duration: expected a number above 0 .* s, got -30"),
         ("leg.4.acceleration", -9, r"navigation.leg: expected a way that a vehicle can take, got \(leg 5: expected a ground"),
         ("imu.gyro_bias", -1, r"navigation.imu.gyro_bias: expected a number of at least 0 .* °/h, got -1"),
-        ("imu.gyro_time", 0, r"navigation.imu.gyro_time: expected a number above 0 .* s, got 0"),
+        ("imu.gyro_time", 0, r"navigation.imu.gyro_time: expected a number of at least 0.001 .* s, got 0"),
         ("initial.velocity", [1, 2], r"navigation.initial.velocity: expected a list of 3 numbers, got \[1, 2\]"),
         ("initial.position", [1, -2, 1], r"navigation.initial.position: expected three standard deviations, each a number above 0"),
     ],

@@ -404,7 +404,7 @@ def test_links_of_many_agents_are_not_laid_out():
 
 NO_STUDY = [
     ({".": [1]}, r"vary\.\."),
-    ({"agent.²": [1]}, "agent: expected a list"),
+    ({"agent.²": [1]}, r"agent.*: expected a list"),
     ({f"agent[{'1' * 5000}].R": [1]}, "vary"),
     ({"model.R": [1, 10**30, 10**400]}, r"vary\.model\.R"),
     ({"model.R": [1.0, 10**400]}, r"vary\.model\.R"),

@@ -613,7 +613,7 @@ def navigated(where="", drop="", **entries):
         (navigated(rate=10.5), "navigation.rate: expected a whole number of ticks in each interval of 1 s, got 10.5 at 10.5 Hz"),
         (navigated(rate=1e5, interval=100, leg=[{"duration": 1e4}]), "navigation.rate: expected at most 1000000 ticks in all"),
         (navigated(drop="speed"), "navigation.speed: expected a value, got nothing"),
-        (navigated("imu", gyro_time=0), r"navigation.imu.gyro_time: expected a number above 0 .* s, got 0"),
+        (navigated("imu", gyro_time=0), r"navigation.imu.gyro_time: expected a number of at least 0.001 .* s, got 0"),
         (navigated("imu", drop="gyro_time"), "navigation.imu.gyro_time: expected a value, got nothing"),
         (navigated("initial", attitude=[0, 1, 1]), "navigation.initial.attitude: expected three standard deviations"),
         (navigated("initial", attitude=[1, 1]), r"navigation.initial.attitude: expected a list of 3 numbers, got \[1, 1\]"),

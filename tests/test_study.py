@@ -126,12 +126,12 @@ def test_a_scenario_file_is_looked_for_beside_the_study(tmp_path):
 @pytest.mark.parametrize(
     ("mapping", "message"),
     [
-        ({}, r"vary: expected a value, got nothing"),
+        ({}, r"vary: expected a table of keys with their values, got nothing"),
         (asked({}), r"vary: expected at least one key with its values, got nothing"),
         (asked({"model.R": []}), r"vary\.model\.R: expected at least one value, got an empty list"),
         (asked({"model.R": 3}), r"vary\.model\.R: expected a list of values, or {from, to, number}, got 3"),
-        (asked({"model.S": [1]}), r"model\.S: expected a known key, got an unknown one, 'S'"),
-        (asked({"modle.R": [1]}), r"modle: expected a known key"),
+        (asked({"model.S": [1]}), r"vary\.model\.S: expected a known key, got an unknown one, 'S'"),
+        (asked({"modle.R": [1]}), r"vary\.modle\.R: expected a known key, got an unknown one"),
         (asked({"methods": ["simplified"]}), r"vary\.methods: expected a scenario key such as network\.link, or one"),
         (asked({"method": ["simplest"]}), r"vary\.method: expected one of simplified, .*, got 'simplest'"),
         (asked({"network.link": {"from": 0, "to": 1}}), r"vary\.network\.link\.number: expected how many values"),

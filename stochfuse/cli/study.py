@@ -64,7 +64,8 @@ def study(
         typer.Option(metavar="FILE", help="Draw the front, or the column over two keys: .png, .svg or .pdf."),
     ] = None,
     over: Annotated[
-        str | None, typer.Option(metavar="KEY,KEY", help="Keys that the plot is drawn over; default: the first two.")
+        str | None,
+        typer.Option(metavar="KEY[,KEY]", help="Keys that the plot is drawn over; default: the first two that vary."),
     ] = None,
     where: Annotated[
         list[str] | None,
@@ -72,7 +73,9 @@ def study(
             metavar="KEY=VALUE", help="Only points with this value of a key, in the plot or the front; may be repeated."
         ),
     ] = None,
-    kind: Annotated[Kind, typer.Option(help="What is drawn over two keys.")] = Kind.heat,
+    kind: Annotated[
+        Kind | None, typer.Option(help="What is drawn over two keys; default: heat.", show_default=False)
+    ] = None,
     digits: DigitsOption = 5,
     format: Annotated[
         Format | None, typer.Option("--format", "-f", help="Format of what is shown; default: table.")
@@ -91,22 +94,22 @@ def study(
     from stochfuse.studies.running import study as run
 
     check_files(output, plot, study)
-    if over is not None and (plot is None or pareto):
-        raise UsageError("--over: expected --plot without --pareto")
-    if where and plot is None and not pareto:
-        raise UsageError("--where: expected --plot or --pareto")
+    for option, value in (("--over", over), ("--kind", kind)):
+        if value is not None and (plot is None or pareto):
+            raise UsageError(f"{option}: expected --plot without --pareto")
+    for option, value in (("--where", where or None), ("--column", column), ("--step", step)):
+        if value is not None and plot is None and not pareto:
+            raise UsageError(f"{option}: expected --plot or --pareto")
     if dask is not None and workers != 1:
         raise UsageError("--workers: expected nothing with --dask, whose cluster has its own")
     with _executor(dask, workers) as (executor, width), _shown() as progress:
         target = result_path(study, output)
         try:
             results = run(study, target, workers=width, executor=executor, restart=restart, progress=progress)
-        except BaseException as error:
+        except KeyboardInterrupt:
             progress.stop()
-            if isinstance(error, KeyboardInterrupt):
-                typer.echo("note: finished points are kept: the same command goes on", err=True)
-            if restart:
-                typer.echo("note: --restart begins anew; to go on, leave it out", err=True)
+            command = "the same command without --restart" if restart else "the same command"
+            typer.echo(f"note: finished points are kept: {command} goes on", err=True)
             raise
     _tell(results)
     if pareto:
@@ -116,7 +119,7 @@ def study(
         from stochfuse.report.study_plots import plot_over
 
         keys = None if over is None else tuple(key.strip() for key in over.split(","))
-        plot_over(results, keys, column, kind.value, _pairs(where or []), step, plot)
+        plot_over(results, keys, column, (kind or Kind.heat).value, _pairs(where or []), step, plot)
     from stochfuse.report import studies
 
     write_report(
@@ -158,8 +161,12 @@ def _pareto(
 
 
 def _tell(results: Results) -> None:
+    from stochfuse.errors import StochfuseError
+
     if results.failed:
         point, reason = results.first_errors[0]
+        if results.failed == results.plan.size:
+            raise StochfuseError(f"all {results.failed} points failed (see {results.path}); the first: {reason}")
         typer.echo(
             f"warning: {results.failed} of {results.plan.size} points failed; the first, point {point}: {reason}",
             err=True,
@@ -174,6 +181,8 @@ def _pairs(texts: list[str]) -> dict[str, str]:
         key, equals, value = text.partition("=")
         if not equals:
             raise UsageError(f"--where: expected KEY=VALUE, got '{text}'")
+        if key.strip() in found:
+            raise UsageError(f"--where: expected each key once, got {key.strip()} twice")
         found[key.strip()] = value.strip()
     return found
 
@@ -204,7 +213,7 @@ def _executor(address: str | None, workers: int) -> Iterator[tuple[Executor | No
 @contextmanager
 def _shown() -> Iterator[Any]:
     """Show progress on standard error, and leave the terminal as it was whatever happens."""
-    bar = _Bar() if sys.stderr.isatty() else _Lines()
+    bar = _Bar() if sys.stderr is not None and sys.stderr.isatty() else _Lines()
     try:
         yield bar
     finally:

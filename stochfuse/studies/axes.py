@@ -16,6 +16,8 @@ from stochfuse.tables.schema import problems_of
 
 MOST_WHOLE = 2**53
 """Largest whole number: the floating-point numbers beyond have gaps."""
+WHOLE = ("network.agents", "network.steps", "runs", "seed", "max_graphs")
+"""Keys whose ranges have whole numbers only."""
 MOST_VALUES = 1_000_000
 """Values that one key may take."""
 
@@ -132,6 +134,7 @@ def _axis(check: Checker, name: str, value: Any, kind: str) -> Axis | None:
 
 
 def _range(check: Checker, name: str, given: RangeTable, kind: str) -> Axis | None:
+    given = given.model_copy(update={"whole": given.whole or name in WHOLE})
     path, known = f"vary.{name}", len(check.problems)
     low, high = given.from_, given.to
     for key, end in (("from", low), ("to", high)):

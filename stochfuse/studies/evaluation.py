@@ -238,9 +238,30 @@ def _by_noises(
     for members in _alike([numbers[path][items] for path in noises], len(items)) if len(items) else []:
         some = items[members]
         values = {path: float(numbers[path][some[0]]) for path in noises}
-        if alone or not _several(asked, mapping, values, numbers, some, group):
+        some = _possible(asked, mapping, values, numbers, some, group)
+        if len(some) and (alone or not _several(asked, mapping, values, numbers, some, group)):
             for item in some:
                 _several(asked, mapping, values, numbers, np.array([item]), group)
+
+
+def _possible(
+    asked: _Asked,
+    mapping: Mapping[str, Any],
+    values: Mapping[str, float],
+    numbers: Mapping[str, np.ndarray],
+    items: np.ndarray,
+    group: _Group,
+) -> np.ndarray:
+    """Items that are left where equal noises make no scenario: those whose link probability is at fault as well."""
+    if LINK not in numbers:
+        return items
+    try:
+        Scenario.from_mapping(put(mapping, {**values, LINK: 0.5}), asked.plan.scenario_name)
+    except StochfuseError as error:
+        inside = _inside({LINK: numbers[LINK][items]}, len(items))
+        group.errors.update(dict.fromkeys(items[inside].tolist(), _reason(error)))
+        return items[~inside]
+    return items
 
 
 def _several(

@@ -30,7 +30,7 @@ from stochfuse.quantities import unit as unit_of
 from stochfuse.rules import SUMS
 from stochfuse.scenario import Scenario, is_preset, parse, read_file, read_text
 from stochfuse.studies.axes import Axis, read_axes
-from stochfuse.studies.schema import StudyFile
+from stochfuse.studies.schema import EXPECTED, StudyFile
 from stochfuse.tables.schema import problems_of, structure_problems
 
 SCHEMA = "stochfuse.study/1"
@@ -240,7 +240,7 @@ def load_study(source: str | Path | Mapping[str, Any]) -> Plan:
         name, mapping, folder = "study", dict(source), Path()
     else:
         name, text = read_file(source)
-        mapping, folder = parse(name, text), Path(source).parent
+        mapping, folder = parse(name, text, "`stochfuse scenario schema --study`"), Path(source).parent
     try:
         return _resolved(name, mapping, folder)
     except RecursionError:
@@ -248,7 +248,7 @@ def load_study(source: str | Path | Mapping[str, Any]) -> Plan:
 
 
 def _resolved(name: str, mapping: Mapping[str, Any], folder: Path) -> Plan:
-    problems = problems_of(StudyFile, mapping)
+    problems = problems_of(StudyFile, mapping, EXPECTED)
     if problems:
         raise ScenarioError(name, problems)
     scenario = mapping.get("scenario", "thesis-transient")
@@ -384,7 +384,7 @@ def _example(name: str, base: Mapping[str, Any], axes: tuple[Axis, ...]) -> Scen
     last = {axis.name: axis.given[-1] if axis.given is not None else axis.value(axis.high) for axis in keys}
     problems = structure_problems(put(base, first))
     if problems:
-        raise ScenarioError(name, problems)
+        raise ScenarioError(name, [_varied(problem, first) for problem in problems])
     failed: StochfuseError | None = None
     for values in (first, last, {}):
         try:
@@ -392,6 +392,12 @@ def _example(name: str, base: Mapping[str, Any], axes: tuple[Axis, ...]) -> Scen
         except StochfuseError as error:
             failed = failed or error
     raise failed or UsageError("no point can be made")
+
+
+def _varied(problem: Problem, values: Mapping[str, Any]) -> Problem:
+    """Return a scenario's problem by the key of [vary] that it comes from."""
+    key = next((k for k in values if k == problem.path or k.startswith((f"{problem.path}.", f"{problem.path}["))), None)
+    return problem if key is None else problem._replace(path=f"vary.{key}")
 
 
 def _check_report(name: str, quantities: tuple[str, ...], metrics: tuple[str, ...], example: Scenario) -> None:

@@ -70,6 +70,16 @@ class StudyReportTable(Table):
     )
 
 
+EXPECTED = {
+    "scenario": "a preset's name, a file, or a table",
+    "vary": "a table of keys with their values",
+    "report.agent": "mean, worst, best or an agent's number",
+    "report.quantity": "a quantity or a list of them",
+    "report.metric": "a metric or a list of them",
+}
+"""What keys take that take several kinds of values."""
+
+
 class StudyFile(Table):
     """A stochfuse study."""
 

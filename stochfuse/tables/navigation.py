@@ -57,10 +57,10 @@ _IMU = {
     "velocity_random_walk": _Range(0.0, 1e3, "m/s/√h"),
     "gyro_bias": _Range(0.0, 1e5, "°/h"),
     "gyro_instability": _Range(0.0, 1e5, "°/h"),
-    "gyro_time": _Range(0.0, 1e9, "s", open=True),
+    "gyro_time": _Range(1e-3, 1e9, "s"),
     "accelerometer_bias": _Range(0.0, 1e3, "mg"),
     "accelerometer_instability": _Range(0.0, 1e3, "mg"),
-    "accelerometer_time": _Range(0.0, 1e9, "s", open=True),
+    "accelerometer_time": _Range(1e-3, 1e9, "s"),
 }
 _INITIAL = {
     "attitude": _Range(0.0, 90.0, "°", open=True),

@@ -6,6 +6,8 @@ scenario, wherever it comes from.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, Literal
 
 from pydantic import ConfigDict, Field, ValidationError
@@ -188,14 +190,25 @@ def structure_problems(mapping: Any) -> list[Problem]:
     return problems + [problem for problem in problems_of(ScenarioFile, mapping) if problem.path not in known]
 
 
-def problems_of(structure: type[Table], mapping: Any) -> list[Problem]:
-    """Return every key of a parsed file that does not fit a structure, once each."""
+def problems_of(
+    structure: type[Table], mapping: Any, expected: Mapping[str, str] = MappingProxyType({})
+) -> list[Problem]:
+    """Return every key of a parsed file that does not fit a structure, once each.
+
+    Parameters
+    ----------
+    expected : what some keys take, by their paths, where the structure alone would not say it well.
+    """
     problems: dict[str, Problem] = {}
     try:
         structure.model_validate(mapping)
     except ValidationError as error:
         for entry in error.errors(include_url=False, include_context=True):
             problem = _problem(entry)
+            for path, words in expected.items():
+                if problem.path == path or problem.path.startswith((f"{path}.", f"{path}[")):
+                    got = "nothing" if entry["type"] == "missing" else _got(entry, [])
+                    problem = Problem(path, words, got)
             problems.setdefault(problem.path, problem)
     return list(problems.values())
 
