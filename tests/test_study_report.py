@@ -388,7 +388,7 @@ def test_a_front_of_one_point_is_said_to_be_one():
     ("column", "words"),
     [
         ("claimed.trace", "expected claimed posterior trace [m²]"),
-        ("consistency.trace", "posterior consistency trace"),
+        ("consistency.trace", "posterior consistency, actual / claimed (> 1: overconfident): trace"),
         ("claimed.trace.standard_error", "standard error of claimed trace"),
         ("messages.nodes", "nodes received per agent and step"),
     ],
@@ -687,7 +687,7 @@ def test_pareto_figure_has_the_front_as_steps_over_all_points():
     assert sum(len(c.get_offsets()) for c in marked) == len(found.points)
     assert {t.get_text() for t in axes.texts} <= {str(p) for p in found.points}
     assert "1 failed point not drawn" in words_in(figure)
-    assert axes.get_xlabel() == "nodes received per agent and step, mean over the steps"
+    assert axes.get_xlabel() == "nodes received per agent and step, mean over all steps"
     assert axes.get_ylabel() == "expected claimed posterior trace [m²]"
 
 

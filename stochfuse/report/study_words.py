@@ -44,13 +44,17 @@ def spoken(plan: Plan, column: str) -> str:
     label, quantity = plan.labels[column], column.partition(".")[0]
     if column.endswith(ERROR) or not label.startswith(quantity):
         return label
-    words = {"rms": "root-mean-square posterior error,", **{q: f"expected {q} posterior" for q in EXPECTED}}
+    words = {
+        "rms": "root-mean-square posterior error,",
+        "consistency": "posterior consistency, actual / claimed (> 1: overconfident):",
+        **{q: f"expected {q} posterior" for q in EXPECTED},
+    }
     return words.get(quantity, f"posterior {quantity}") + label.removeprefix(quantity)
 
 
 def load_label(plan: Plan) -> str:
     """What the load is, in words."""
-    return f"{plan.labels[NODES]}, mean over the steps"
+    return f"{plan.labels[NODES]}, mean over all steps"
 
 
 def failures(failed: int) -> str:

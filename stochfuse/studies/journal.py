@@ -205,7 +205,9 @@ class Journal:
 
 
 def changed(before: Any, now: Any, path: str = "") -> str:
-    """Return the first difference between two records in words; empty if there is none."""
+    """Return the first difference between two records in words; empty if there is none but the study file's name."""
+    if path == "name":
+        return ""
     if isinstance(before, Mapping) and isinstance(now, Mapping):
         for key in [*now, *(k for k in before if k not in now)]:
             found = changed(before.get(key), now.get(key), f"{path}.{key}" if path else key)
