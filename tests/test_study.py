@@ -132,7 +132,10 @@ def test_a_scenario_file_is_looked_for_beside_the_study(tmp_path):
         (asked({"model.R": 3}), r"vary\.model\.R: expected a list of values, or {from, to, number}, got 3"),
         (asked({"model.S": [1]}), r"vary\.model\.S: expected a known key, got an unknown one, 'S'"),
         (asked({"modle.R": [1]}), r"vary\.modle\.R: expected a known key, got an unknown one"),
-        (asked({"methods": ["simplified"]}), r"vary\.methods: expected a scenario key such as network\.link, or one"),
+        (
+            asked({"methods": ["simplified"]}),
+            r"vary\.methods: expected a key of the scenario such as network\.link or agent\[2\]\.R .*, or one of",
+        ),
         (asked({"method": ["simplest"]}), r"vary\.method: expected one of simplified, .*, got 'simplest'"),
         (asked({"network.link": {"from": 0, "to": 1}}), r"vary\.network\.link\.number: expected how many values"),
         (asked({"network.link": {"from": 1, "to": 0, "number": 2}}), r"link\.to: expected at least from, 1, got 0"),

@@ -90,7 +90,6 @@ def study(
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from stochfuse.cli.options import check_files
     from stochfuse.errors import UsageError
-    from stochfuse.studies.running import result_path
     from stochfuse.studies.running import study as run
 
     check_files(output, plot, study)
@@ -103,9 +102,8 @@ def study(
     if dask is not None and workers != 1:
         raise UsageError("--workers: expected nothing with --dask, whose cluster has its own")
     with _executor(dask, workers) as (executor, width), _shown() as progress:
-        target = result_path(study, output)
         try:
-            results = run(study, target, workers=width, executor=executor, restart=restart, progress=progress)
+            results = run(study, output, workers=width, executor=executor, restart=restart, progress=progress)
         except KeyboardInterrupt:
             progress.stop()
             command = "the same command without --restart" if restart else "the same command"

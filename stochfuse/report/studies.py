@@ -122,11 +122,13 @@ def titles(results: Results, summary: Summary) -> tuple[str, ...]:
     """Lines that say what the study is, how much of it there is and what the columns mean."""
     plan = results.plan
     natures = "; ".join(f"{nature}: {counted(n, 'point')}" for nature, n in summary.natures.items())
+    more = results.failed - len(results.first_errors)
     return (
         f"Study {plan.name}: {design(plan)}",
         f"Scenario {plan.scenario_name}; {whose(plan)}",
         f"{results.path.name}: {counted(results.rows, 'row')}, {failures(results.failed)}",
         *(f"failed: {points}: {reason}" for points, reason in _together(results.first_errors)),
+        *([f"failed: {counted(more, 'point')} more"] if more else []),
         *([natures] if natures else []),
         *(f"{column}: {spoken(plan, column)}" for column in plan.columns),
         "least and greatest after each point's last step",

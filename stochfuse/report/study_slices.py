@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -188,9 +189,17 @@ def _value(plan: Plan, name: str, given: Any) -> Any:
     if axis.values is None:
         raise UsageError(f"--where: expected a key with listed values, got {name}, which varies continuously")
     for value in axis.values:
-        if str(value) == str(given) or _number(value) == _number(given) is not None:
+        if str(value) == str(given) or _number(value) == _number(given) is not None or _same(value, given):
             return value
     raise UsageError(f"--where {name}: expected {_listed(axis, ' or ')}, got {given}")
+
+
+def _same(value: Any, given: Any) -> bool:
+    """Whether two texts are the same list in JSON."""
+    try:
+        return json.loads(value) == json.loads(given)
+    except (TypeError, ValueError):
+        return False
 
 
 def _number(value: Any) -> float | None:

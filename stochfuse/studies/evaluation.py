@@ -278,11 +278,15 @@ def _several(
             scenario = Scenario.from_mapping(put(mapping, values), asked.plan.scenario_name)
             links, rows = None, np.zeros(len(items), dtype=int)
         else:
-            different, rows = np.unique(numbers[LINK][items], return_inverse=True)
-            first = {LINK: float(different[0])}
+            given, rows = np.unique(numbers[LINK][items], return_inverse=True)
+            first = {LINK: float(given[0])}
             scenario = Scenario.from_mapping(put(mapping, {**values, **first}), asked.plan.scenario_name)
-            links = different.tolist()
-        found = predict_several(scenario, links, asked.method, asked.quantities, **asked.settings)
+            links = given.tolist()
+        # what the optimum claims is the optimum
+        names = ["optimal" if asked.method == "optimal" and q == "claimed" else q for q in asked.quantities]
+        different = list(dict.fromkeys(names))
+        several = predict_several(scenario, links, asked.method, different, **asked.settings)
+        found = [several[different.index(name)] for name in names]
         _fill(asked, found, items, group, rows)
     except Exception as error:
         if len(items) > 1:

@@ -37,6 +37,7 @@ SCHEMA = "stochfuse.study/1"
 SETTINGS = ("method", "estimator", "criterion", "runs", "seed", "max_graphs", "prune")
 """Names in [vary] that are no scenario keys."""
 _WORDS = {"method": METHODS, "estimator": ESTIMATORS, "criterion": CRITERIA}
+_KEY = "a key of the scenario such as network.link or agent[2].R (of the second agent table)"
 _LEAST = {"runs": 2, "seed": 0, "max_graphs": 1}
 _PATH = re.compile(r"[^.\[\]]+(\[[1-9][0-9]{0,8}\])?(\.[^.\[\]]+(\[[1-9][0-9]{0,8}\])?)*")
 MESSAGES, NODES = "messages", "messages.nodes"
@@ -97,7 +98,7 @@ class Plan:
                 unit = unit_of(quantity, m)
                 found[f"{quantity}.{m.name}"] = f"{quantity} {noun(quantity, m)}{f' [{unit}]' if unit else ''}"
                 if "monte-carlo" in self.methods:
-                    found[f"{quantity}.{m.name}{ERROR}"] = f"standard error of {quantity} {noun(quantity, m)}"
+                    found[f"{quantity}.{m.name}{ERROR}"] = f"standard error of {found[f'{quantity}.{m.name}']}"
         return found
 
     @property
@@ -191,7 +192,7 @@ def put(mapping: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]
         for part in tables:
             place = _entered(path, place, part)
         if not isinstance(place, dict) or not isinstance(last, str):
-            raise ScenarioError("study", [Problem(f"vary.{path}", "a key of the scenario", shown(path))])
+            raise _nowhere(path)
         place[last] = value
         # a link probability takes the place of everything else that says how likely messages are
         if path == "network.link":
@@ -212,7 +213,11 @@ def _entered(path: str, place: Any, part: str | int) -> Any:
         return place.setdefault(part, {})
     if isinstance(part, int) and isinstance(place, list) and 0 <= part < len(place):
         return place[part]
-    raise ScenarioError("study", [Problem(f"vary.{path}", "a key of the scenario", shown(path))])
+    raise _nowhere(path)
+
+
+def _nowhere(path: str) -> ScenarioError:
+    return ScenarioError("study", [Problem(f"vary.{path}", _KEY, shown(path))])
 
 
 def software() -> dict[str, str]:
@@ -351,8 +356,7 @@ def _check_settings(check: Checker, axes: tuple[Axis, ...]) -> None:
             if not all(isinstance(v, bool) for v in axis.given or (axis.low,)):
                 check.note(path, "true or false", shown((axis.given or (axis.low,))[0]))
         elif "." not in axis.name or not _PATH.fullmatch(axis.name):
-            known = ", ".join(SETTINGS)
-            check.note(path, f"a scenario key such as network.link, or one of {known}", f"'{axis.name}'")
+            check.note(path, f"{_KEY}, or one of {', '.join(SETTINGS)}", f"'{axis.name}'")
 
 
 def _size(check: Checker, axes: tuple[Axis, ...], kind: str, points: int | None) -> int:
@@ -382,7 +386,10 @@ def _example(name: str, base: Mapping[str, Any], axes: tuple[Axis, ...]) -> Scen
     keys = [axis for axis in axes if axis.name not in SETTINGS]
     first = {axis.name: axis.given[0] if axis.given is not None else axis.value(axis.low) for axis in keys}
     last = {axis.name: axis.given[-1] if axis.given is not None else axis.value(axis.high) for axis in keys}
-    problems = structure_problems(put(base, first))
+    try:
+        problems = structure_problems(put(base, first))
+    except ScenarioError as error:
+        raise ScenarioError(name, error.problems) from None
     if problems:
         raise ScenarioError(name, [_varied(problem, first) for problem in problems])
     failed: StochfuseError | None = None

@@ -2,7 +2,8 @@
 
     point     number of the point, from 0
     …         the varied keys, by their names; matrices and the like as JSON
-    method, estimator, nature     how it was predicted; nature is exact, approximate, bound or sampled
+    method, estimator, nature     how it was predicted; nature is exact, approximate, bound or sampled, of several
+              quantities that of the least certain
     step      number of the step, from 1; empty where the point failed
     …         value columns, "claimed.trace"; empty where the point failed
     error     why the point failed, else empty
