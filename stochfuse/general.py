@@ -12,7 +12,7 @@ is a polynomial whose coefficients are found once; with unequal µ_ij(k) every r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, NamedTuple
@@ -65,6 +65,7 @@ class Outcomes:
     values : numbers for every value in the structure.
     weights : bookkeeping of probabilities.
     of : what is averaged: the estimate itself, or the moments of its error (quantities other than claimed need them).
+    again : what the values claim with moved numbers, to be called for; see `stochfuse.conditioning`.
     """
 
     scenario: Scenario
@@ -74,6 +75,7 @@ class Outcomes:
     values: Claims
     weights: Any
     of: Callable[[Estimate], Any] = itself
+    again: Callable[[], Sequence[Callable[[], Claims]]] = tuple
 
     @property
     def polynomial(self) -> bool:
@@ -90,13 +92,28 @@ class Outcomes:
 
     @cached_property
     def _expected(self) -> list[tuple[list[Any], float]]:
-        groups = len(self.groups)
-        return [expectation(e, self.values, self.weights, groups, self.of) for e in self.structure.endings]
+        return self._expectations(self.values)
 
-    @property
+    def _expectations(self, values: Claims) -> list[tuple[list[Any], float]]:
+        groups = len(self.groups)
+        return [expectation(e, values, self.weights, groups, self.of) for e in self.structure.endings]
+
+    @cached_property
     def rounding(self) -> float:
-        """Estimate of the largest relative rounding error of an outcome's covariance."""
-        return 2e-16 * max(magnified for _, magnified in self._expected)
+        """How far rounding may reach in an expected covariance at any link probability, relative to the deviations.
+
+        The larger of what the last inversion of an outcome's information loses, and what moved numbers change.
+        """
+        lost = 2e-16 * max(magnified for _, magnified in self._expected)
+        again = self.again()
+        return max(lost, float(reach(lambda seed: self._change(again[seed]()), len(again))))
+
+    def _change(self, values: Claims) -> float:
+        """Largest change of an expected covariance if the values claimed others."""
+        quantities = ("claimed",) if self.of is itself else ("claimed", "actual", "rms")
+        pairs = zip(self._expected, self._expectations(values), strict=True)
+        groups = [pair for (found, _), (moved, _) in pairs for pair in zip(found, moved, strict=True)]
+        return max(float(change(matrix(q, a), matrix(q, b)).max()) for q in quantities for a, b in groups)
 
     def coefficients(self, step: int, group: int = 0, quantity: str = "claimed") -> np.ndarray:
         """A_0 … A_L of E[P(step)](µ) = Σ A_c µ^c (1−µ)^(L−c), shape (L + 1, d, d); or of another quantity's matrix.
@@ -327,8 +344,11 @@ def outcomes(
         criterion=criterion,
         progress=progress,
     )
-    of = moments if errors else itself
-    return Outcomes(scenario, rows, found.groups, found.structure, found.made.claims(), found.weights, of)
+    of, again = moments if errors else itself, tuple
+    if estimator in SUMS:
+        sources = partial(error_sources, scenario) if errors else partial(sources_of, scenario, records)
+        again = partial(moved_claims, scenario, found.made.estimator.ledger, sources)
+    return Outcomes(scenario, rows, found.groups, found.structure, found.made.claims(), found.weights, of, again)
 
 
 class Enumerated(NamedTuple):

@@ -284,10 +284,16 @@ def estimated(information: Information, step: int) -> tuple[Estimate, np.ndarray
     Raises
     ------
     NoAnswerError
-        If some information is not positive definite.
+        If some information is not positive definite, or has no inverse in floating point.
     """
     check_definite(information.Y, step)
-    estimate = from_information(information)
+    try:
+        estimate = from_information(information)
+    except np.linalg.LinAlgError:
+        raise NoAnswerError(
+            f"ill-conditioned: at step {step} the information claimed in some outcome is singular to rounding, and no "
+            "covariance follows"
+        ) from None
     return estimate, _diagonal(estimate.P) * _diagonal(information.Y)
 
 

@@ -18,8 +18,9 @@ P symmetric and positive semi-definite in floating point.  Q stands for the nois
 the model has a noise gain G, the caller passes G Q Gᵀ.  The information form needs an invertible F and takes a
 singular Y (no information at all) and a singular Q.
 
-Accuracy.  The covariance form is accurate to rounding relative to P⁻; entries of P far below it (precise sensors:
-R ≪ H P⁻Hᵀ) lose relative digits when the state has several dimensions.  The square-root form keeps them.
+Accuracy.  The covariance form is accurate to rounding relative to P⁻, times the condition number of H P⁻Hᵀ + R in units
+of its own deviations: precise sensors (R ≪ H P⁻Hᵀ) that measure nearly the same direction lose more.  Entries of P far
+below P⁻ lose relative digits when the state has several dimensions.  The square-root form keeps them.
 """
 
 from __future__ import annotations

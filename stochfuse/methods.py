@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse import simplified
+from stochfuse import conditioning, simplified
+from stochfuse.engines.rounding import PROMISED, lost
 from stochfuse.errors import UsageError
 from stochfuse.names import CRITERIA, ESTIMATORS, METHODS
 from stochfuse.network import LinkRows
@@ -177,6 +178,8 @@ def predict_several(
 def _simplified(scenario: Scenario, rows: LinkRows, errors: bool) -> dict[str, Any]:
     result = simplified.covariances(scenario, rows)
     moments, notes = Moments(result.P), simplified.departures(scenario, rows)
+    if "square-root" in result.forms or conditioning.ill_noise(scenario):
+        notes += _rounding(simplified.reach_of_rounding(scenario, rows))
     if errors:
         from stochfuse.states import mean_error
 
@@ -191,6 +194,12 @@ def _simplified(scenario: Scenario, rows: LinkRows, errors: bool) -> dict[str, A
         "forms": result.forms,
         "notes": tuple(notes),
     }
+
+
+def _rounding(reach: np.ndarray) -> list[str]:
+    """Say how far rounding may reach in some row of the simplified formulation, where that is too far."""
+    far = lost(reach)
+    return [conditioning.told(float(reach[far].max()))] if far.any() else []
 
 
 def _enumerated(scenario: Scenario, rows: LinkRows, how: Settings, estimator: str, errors: bool) -> dict[str, Any]:
@@ -217,13 +226,10 @@ def _enumerated(scenario: Scenario, rows: LinkRows, how: Settings, estimator: st
             f"{step + 1}) are "
             "left out; what is shown holds given one of the others"
         )
-    moments = found.moments()
-    if found.rounding > 1e-9:
-        notes.append(
-            f"ill-conditioned: rounding may reach a relative {found.rounding:.0e} in the covariance of some outcome"
-        )
+    moments, reach = found.moments(), found.rounding
+    notes += conditioning.notes(reach)
     return {
-        "nature": "exact" if left_out <= 1e-12 else "approximate",
+        "nature": "exact" if left_out <= 1e-12 and reach <= PROMISED else "approximate",
         "moments": moments,
         "group_of": group_of(found.groups),
         "estimator": estimator,
@@ -243,6 +249,7 @@ def _optimal(scenario: Scenario, rows: LinkRows, errors: bool) -> dict[str, Any]
     found, groups = optimum(scenario, rows)
     bound = float(found.bound.max())
     notes = [f"the optimum is proved to lie within a relative {bound:.0e} of the value shown"] if bound else []
+    notes += conditioning.notes(found.rounding)
     moments = Moments(found.P)
     if errors:
         if found.bias is None:
@@ -252,7 +259,7 @@ def _optimal(scenario: Scenario, rows: LinkRows, errors: bool) -> dict[str, Any]
         # what the optimum claims is what it achieves
         moments = Moments(found.P, found.P, found.bias, found.square)
     return {
-        "nature": "bound" if bound else "exact",
+        "nature": "approximate" if found.rounding > PROMISED else "bound" if bound else "exact",
         "moments": moments,
         "group_of": group_of(groups),
         "estimator": "optimal",

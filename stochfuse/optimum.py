@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from stochfuse.conditioning import change, reach, suspects_in_square_root
+from stochfuse.conditioning import change, reach, suspects
 from stochfuse.engines.contact_chain import Chain, Filter, TooManyPathsError, check_size, expected_optimum
 from stochfuse.engines.contacts import contacts, number_of_paths
 from stochfuse.engines.enclosure import enclosed_optimum
@@ -46,7 +46,7 @@ def optimum(scenario: Scenario, rows: LinkRows) -> tuple[Chain, tuple[tuple[int,
         found = every_path(given)
     except TooManyPathsError:
         found, go = bounds(given), bounds
-    if suspects_in_square_root(scenario, Noises(P0=scenario.P0[None])).any():
+    if suspects(scenario, Noises(P0=scenario.P0[None])).any():
         found = found._replace(rounding=float(rounding(given, found, go).max()))
     return found._replace(paths=number_of_paths(network)) if plain else found, groups
 

@@ -300,7 +300,10 @@ def test_numbers_beyond_floating_point():
     made["model"]["F"] = 1e10
     scenario = sf.Scenario.from_mapping(made)
     noises = Noises(Q=np.array([1.0, 1e308])[:, None, None], R=np.full((2, 1, 1), 1e307), P0=np.full((2, 1, 1), 1e300))
-    with np.errstate(all="ignore"), pytest.raises(NotABatchError, match="expected a finite optimum, got one that is not"):
+    with (
+        np.errstate(all="ignore"),
+        pytest.raises(NotABatchError, match="expected a finite optimum, got one that is not"),
+    ):
         optimum.moments(scenario, np.array([0.5, 0.5]), noises)
 
 

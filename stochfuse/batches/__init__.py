@@ -12,6 +12,8 @@ import numpy as np
 
 from stochfuse.batches import general, optimum, simplified
 from stochfuse.checks import covariance_fault
+from stochfuse.conditioning import told as rounded
+from stochfuse.engines.rounding import PROMISED as EXACT
 from stochfuse.errors import NotABatchError
 from stochfuse.methods import LFG, MOST_GRAPHS, group_of
 from stochfuse.model import Noises
@@ -19,8 +21,6 @@ from stochfuse.prediction import Prediction
 from stochfuse.quantities import Moments
 from stochfuse.scenario import Scenario
 
-EXACT = 1e-9
-"""Relative rounding beyond which an exact average is called approximate."""
 WORTHLESS = 1e-3
 """Relative rounding beyond which it is no answer."""
 
@@ -104,22 +104,18 @@ def _found(
     if method == "optimal":
         best = optimum.moments(scenario, link, noises, errors=errors)
         of, groups, estimator = best.moments, best.groups, "optimal"
-        natures, faults = _natures(len(link), "exact"), {}
+        rounding = best.rounding
     elif method in ("general", "naive"):
         estimator = "naive" if method == "naive" else settings.get("estimator") or scenario.estimator or LFG
         graphs = settings.get("max_graphs", MOST_GRAPHS)
         every = general.moments(scenario, link, noises, estimator, errors=errors, max_graphs=graphs)
         of, groups = every.moments, every.groups
-        natures = np.where(every.rounding > EXACT, "approximate", "exact")
-        faults = {int(i): rounded(every.rounding[i]) for i in np.flatnonzero(every.rounding > WORTHLESS)}
+        rounding = every.rounding
     else:
         raise NotABatchError(f"a batch: expected method simplified, general, naive or optimal, got {method}")
+    natures = np.where(rounding > EXACT, "approximate", "exact")
+    faults = {int(i): rounded(rounding[i]) for i in np.flatnonzero(rounding > WORTHLESS)}
     return _Found(of, group_of(groups), estimator, natures, {**_faults(of), **faults})
-
-
-def rounded(relative: float) -> str:
-    """Say that rounding has eaten the answer."""
-    return f"ill-conditioned: rounding may reach a relative {relative:.0e} in the covariance of some outcome"
 
 
 def _natures(items: int, nature: str) -> np.ndarray:

@@ -8,12 +8,14 @@ weights are worked out side by side, each item's claims weighed at its own µ; i
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from stochfuse.batches.claims import Claims, Key, Step, claims_of
-from stochfuse.errors import NotABatchError
+from stochfuse.conditioning import NO_DIGIT, MovedSources, change, reach, suspects
+from stochfuse.errors import NotABatchError, StochfuseError
 from stochfuse.information import Sources, estimated, evaluate_atoms, unpacked
 from stochfuse.kalman import Estimate
 from stochfuse.model import Noises
@@ -37,7 +39,7 @@ class Found(NamedTuple):
     ----------
     moments : (items, steps, groups, …).
     groups : agents that are alike.
-    rounding : (items,) estimate of the largest relative rounding error of an outcome's covariance.
+    rounding : (items,) how far rounding may reach in an expected covariance, relative to the standard deviations.
     states : number of graphs carried before each step's exchange.
     outcomes : number of outcomes.
     """
@@ -144,9 +146,51 @@ def _numbers(scenario: Scenario, errors: bool) -> int:
 def _block(
     claims: Claims, scenario: Scenario, link: np.ndarray, noises: Noises, errors: bool
 ) -> tuple[Moments, np.ndarray]:
-    """Moments (items, steps, groups, …), and estimate of the rounding in each item."""
+    """Moments (items, steps, groups, …), and how far rounding may reach in each item."""
     different, of = _distinct(noises)
-    sources = error_sources(scenario, different) if errors else sources_of(batched(scenario, different))
+    found, magnified = _over_claims(claims, link, of, _sources(scenario, different, errors), errors)
+    far, suspect = 2e-16 * magnified, np.flatnonzero(suspects(scenario, different)[of])
+    if len(suspect):
+        theirs = Moments(*(None if m is None else m[suspect] for m in found))
+        again = partial(_changes, claims, scenario, link[suspect], noises.take(suspect), errors, theirs)
+        far[suspect] = np.maximum(far[suspect], reach(again))
+    return found, far
+
+
+def _changes(
+    claims: Claims, scenario: Scenario, link: np.ndarray, noises: Noises, errors: bool, found: Moments, seed: int
+) -> np.ndarray:
+    """By how much moved numbers change each item's moments, (items,)."""
+    different, of = _distinct(noises)
+    try:
+        moved, _ = _over_claims(claims, link, of, MovedSources(_sources(scenario, different, errors), seed), errors)
+    except (StochfuseError, np.linalg.LinAlgError):
+        if len(link) == 1:
+            return np.array([NO_DIGIT])
+        # halves, until those are found of which no digit is left
+        half = len(link) // 2
+        parts = []
+        for some in (np.s_[:half], np.s_[half:]):
+            theirs = Moments(*(None if m is None else m[some] for m in found))
+            parts.append(_changes(claims, scenario, link[some], noises.take(some), errors, theirs, seed))
+        return np.concatenate(parts)
+    pairs = [(found.P, moved.P), (found.actual, moved.actual), (found.square, moved.square)]
+    return np.max([change(P, M).max(axis=(1, 2)) for P, M in pairs if P is not None and M is not None], axis=0)
+
+
+def _sources(scenario: Scenario, noises: Noises, errors: bool) -> Sources:
+    return error_sources(scenario, noises) if errors else sources_of(batched(scenario, noises))
+
+
+def _over_claims(
+    claims: Claims, link: np.ndarray, of: np.ndarray, sources: Sources, errors: bool
+) -> tuple[Moments, np.ndarray]:
+    """Moments (items, steps, groups, …), and by how much rounding grew in the last inversion of each item.
+
+    Parameters
+    ----------
+    of : which item of the sources each has.
+    """
     atoms = evaluate_atoms(claims.atoms, sources, lambda values, atoms: _sums(claims.values[values], atoms))
     magnified, steps = np.ones(len(atoms[0])), []
     for number, step in enumerate(claims.steps, start=1):
@@ -162,7 +206,7 @@ def _block(
                     expected[place] = part if expected[place] is None else expected[place] + part
         steps.append(expected)
     stacked = [None if m[0] is None else np.stack(m, axis=1) for m in zip(*steps, strict=True)]
-    return Moments(*stacked), 2e-16 * magnified[of]
+    return Moments(*stacked), magnified[of]
 
 
 def _chunks(step: Step, numbers: int) -> list[slice]:

@@ -8,18 +8,19 @@ own link probability.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from stochfuse.batches.claims import Key, typical_rows
 from stochfuse.batches.general import check_batch, with_starts
+from stochfuse.conditioning import suspects
 from stochfuse.engines.contact_chain import Filter, TooManyPathsError, by_counts, check_size, joined, over_paths
 from stochfuse.engines.contacts import Contacts, contacts, number_of_paths
 from stochfuse.errors import NotABatchError
 from stochfuse.model import Model, Noises, Sensor
 from stochfuse.network import restricted, uniform_rows
-from stochfuse.optimum import counted, filter_of, groups_of
+from stochfuse.optimum import counted, filter_of, groups_of, rounding
 from stochfuse.quantities import Moments
 from stochfuse.scenario import Scenario
 from stochfuse.sources import batched
@@ -39,12 +40,14 @@ class Found(NamedTuple):
     groups : agents that are alike.
     paths : number of paths gone through.
     bound : (items, steps) relative half-width of what encloses it: 0.
+    rounding : (items,) how far rounding may reach in the covariance, relative to the standard deviations.
     """
 
     moments: Moments
     groups: tuple[tuple[int, ...], ...]
     paths: int
     bound: np.ndarray
+    rounding: np.ndarray
 
 
 def moments(scenario: Scenario, link: np.ndarray, noises: Noises, *, errors: bool = False) -> Found:
@@ -72,12 +75,29 @@ def moments(scenario: Scenario, link: np.ndarray, noises: Noises, *, errors: boo
     noises = with_starts(scenario, noises, len(link))
     size = _items(chain, paths, scenario.model.dimension)
     blocks = [slice(first, min(first + size, len(link))) for first in range(0, len(link), size)]
-    given = (filter_of(batched(scenario, noises.take(some))) for some in blocks)
-    found = joined([over_paths(f, chain, network.steps, some) for f, some in zip(given, blocks, strict=True)])
+    found = [_block(scenario, noises.take(some), chain, some) for some in blocks]
+    reached = np.concatenate([far for _, far in found])
+    found = joined([part for part, _ in found])
     if not np.isfinite(found.P).all():
         raise NotABatchError("a batch by method optimal: expected a finite optimum, got one that is not")
     of = Moments(found.P, found.P, found.bias, found.square) if errors else Moments(found.P)
-    return Found(of, groups, paths, found.bound)
+    return Found(of, groups, paths, found.bound, reached)
+
+
+def _block(
+    scenario: Scenario, noises: Noises, chain: Contacts, some: slice
+) -> tuple[tuple[list[np.ndarray], int], np.ndarray]:
+    """What `over_paths` finds for some items, and how far rounding may reach in each, (items,)."""
+    steps = scenario.network.steps
+    found = over_paths(filter_of(batched(scenario, noises)), chain, steps, some)
+    far = np.zeros(len(found[0][0]))
+    suspect = np.flatnonzero(suspects(scenario, noises))
+    if len(suspect):
+        given = filter_of(batched(scenario, noises.take(suspect)))
+        theirs = joined([([moment[suspect] for moment in found[0]], found[1])])
+        rows: Any = some.start + suspect
+        far[suspect] = rounding(given, theirs, lambda moved: joined([over_paths(moved, chain, steps, rows)]))
+    return found, far
 
 
 @lru_cache(maxsize=MOST_KEPT)

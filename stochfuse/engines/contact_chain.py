@@ -123,7 +123,7 @@ class Filter(NamedTuple):
         """
         F, Q = at_step(self.model.F, step), at_step(self.model.Q, step)
         given = self.numbers
-        sensors = [(at_step(sensor.H, step), given.noise(at_step(sensor.R, step))) for sensor in self.sensors]
+        sensors = [(given.rounded(at_step(s.H, step)), given.noise(at_step(s.R, step))) for s in self.sensors]
         arrived = [(H, R, n) for (H, R), n in zip(sensors, np.moveaxis(counts, -1, 0), strict=True) if n.any()]
         if self.scalar:
             estimate = predict(Estimate(*before), F, Q)
@@ -135,7 +135,6 @@ class Filter(NamedTuple):
         x, L = before.x, given.rounded(predict_factor(given.rounded(before.root), F, given.factor(Q)))
         x = x if x is None else F @ x
         for H, R, n in arrived:
-            H = given.rounded(H)  # noqa: PLW2901
             L = update_factor(L, H, R, lambda s: 1.0 / (1.0 + n[..., None] * s))  # noqa: B023
             x = x if x is None else x - posterior_gain(L, H, R / n[..., None, None]) @ (H @ x)
         return Carried(x, L)

@@ -105,3 +105,15 @@ class Moving(_Moved):
 
     def __init__(self, seed: int):
         self._rng = np.random.default_rng(seed)
+
+    def _errors(self, M: np.ndarray) -> np.ndarray:
+        return ulps(self._rng, M.shape[-2:])
+
+
+def ulps(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Relative errors of `MOVE` ulps, more or less, up or down: none so small that it is rounded away."""
+    return rng.choice([-_ULP, _ULP], size=shape) * rng.uniform(0.5 * MOVE, 1.5 * MOVE, size=shape)
+
+
+MOVE = 8
+"""Ulps by which `Moving` moves numbers."""
