@@ -38,7 +38,7 @@ from stochfuse.arrivals import Counts, like_senders, poisson_binomial
 from stochfuse.averaged import sound
 from stochfuse.checks import covariance_fault
 from stochfuse.engines.mean_field import COMMON, Case, Outcomes, run, run_like
-from stochfuse.errors import NoAnswerError, UsageError
+from stochfuse.errors import StochfuseError, UsageError
 from stochfuse.kalman import Estimate, from_information, to_information, update, update_information
 from stochfuse.model import Noises
 from stochfuse.network import LinkRows, Network, number_of_senders, possible_senders, require_memoryless
@@ -122,7 +122,7 @@ def covariances(scenario: Scenario, rows: LinkRows) -> Covariances:
     UsageError
         If messages are delayed, unlike agents make too many outcomes, or agents do not track one state with independent
         noises.
-    NoAnswerError
+    StochfuseError
         If a covariance grows beyond floating point.
     """
     require_one_state(scenario, "method simplified")
@@ -141,7 +141,7 @@ def covariances(scenario: Scenario, rows: LinkRows) -> Covariances:
         if not np.isfinite(P).all():
             item, why = min(faults(P).items())
             µ = rows.means(scenario.network)[item // group.columns]
-            raise NoAnswerError(f"method simplified: {why} (link probability {µ:g})")
+            raise StochfuseError(f"method simplified: {why} (link probability {µ:g})")
         d = P.shape[1]
         parts.append(P.reshape(steps, d, d, links, group.columns).transpose(3, 0, 4, 1, 2))
     P = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=2)

@@ -343,7 +343,10 @@ def test_a_covariance_beyond_floating_point_is_a_failure_not_a_nan(tmp_path):
     file = tmp_path / "drift.toml"
     file.write_text("[model]\nF = 2\nH = 0\nQ = 1\nR = 1\n[initial]\nP = 1\n[network]\nagents = 2\nsteps = 600\n")
     done = run("predict", str(file), "--format", "json", code=1)
-    assert "error: the prediction is not finite: the values grow beyond floating point" in done.stderr
+    assert (
+        "error: method simplified: the covariance at step 513 is not finite: it grows beyond floating point (link "
+        in (done.stderr)
+    )
     assert done.stdout == ""
 
 

@@ -120,7 +120,7 @@ def test_a_prediction_beyond_floating_point_is_refused_with_step_and_link(unlike
     if unlike:
         source["agent"] = [{}, {"R": 2.0}]
     message = r"method simplified: the covariance at step 4 is not finite: .* \(link probability 0.25\)"
-    with pytest.raises(sf.NoAnswerError, match=message):
+    with pytest.raises(sf.StochfuseError, match=message):
         sf.predict(sf.Scenario.from_mapping(source), [0.25, 0.5])
 
 

@@ -264,7 +264,9 @@ class JournalMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.hold is None and self.committed | self.maybe)
     @rule(data=st.data())
     def a_part_is_damaged(self, data: st.DataObject) -> None:
-        parts = sorted(self.journal.folder.glob("part-*"))
+        # a second damage might mend the first
+        whole = {f"part-{chunk:08d}" for chunk in self.committed | self.maybe}
+        parts = [part for part in sorted(self.journal.folder.glob("part-*")) if part.name in whole]
         if not parts:
             return
         part = data.draw(st.sampled_from(parts))

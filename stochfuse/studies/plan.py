@@ -47,6 +47,8 @@ MOST_DRAWN = 20_000_000
 """Numbers of a Latin hypercube, points times keys."""
 CHUNK = {"simplified": 16384, "general": 256, "naive": 256, "optimal": 256, "monte-carlo": 4}
 """Points that are evaluated, and written, together."""
+LEAST_PARTS = 16
+"""Chunks of a study, if it has as many points, of which single ones may take long."""
 CHUNK_OF_PASTS = 16
 """The same for estimators whose numbers are worked point by point."""
 MOST_NUMBERS = 4_000_000
@@ -129,6 +131,9 @@ class Plan:
         most = min(CHUNK[method] for method in self.methods)
         if set(self.methods) & {"general"} and not set(estimators) <= set(SUMS):
             most = min(most, CHUNK_OF_PASTS)
+        if set(self.methods) & {"general", "naive", "optimal"}:
+            # a few points can be hours of work, of which some should be kept, and which workers should share
+            most = min(most, -(-self.size // LEAST_PARTS))
         steps = next((a for a in self.axes if a.name == "network.steps"), None)
         longest = self.example.network.steps
         if steps is not None and steps.kind in ("int", "float"):
@@ -315,7 +320,9 @@ def _built(record: Mapping[str, Any], name: str) -> Plan:
         raise ScenarioError(name, check.problems)
     report = given.report
     metric = (example.metric or "trace") if report.metric is None else report.metric
-    quantities, metrics = _several(report.quantity), _several(metric)
+    # the command line separates quantities by commas; those of a metric are part of it
+    quantities = _several(report.quantity.split(",") if isinstance(report.quantity, str) else report.quantity)
+    metrics = _several(metric)
     _check_report(name, quantities, metrics, example)
     if isinstance(report.agent, int) and report.agent > example.network.agents and "network.agents" not in varied:
         expected = f"an agent from 1 to {example.network.agents}"
@@ -338,7 +345,7 @@ def _built(record: Mapping[str, Any], name: str) -> Plan:
 
 
 def _several(words: str | list[str]) -> tuple[str, ...]:
-    return (words,) if isinstance(words, str) else tuple(words)
+    return (words,) if isinstance(words, str) else tuple(word.strip() for word in words)
 
 
 def _check_settings(check: Checker, axes: tuple[Axis, ...]) -> None:
