@@ -46,4 +46,14 @@ class NotABatchError(UsageError):
 
 
 class NoAnswerError(StochfuseError):
-    """The question has no answer: the filter diverges, the target cannot be reached."""
+    """The question has no answer: the filter diverges, the target cannot be reached.
+
+    Parameters
+    ----------
+    message : why.
+    items : places of the items of a batch that have none, where they are known.
+    """
+
+    def __init__(self, message: str = "", items: Iterable[int] = ()):
+        self.items = tuple(items)
+        super().__init__(message)

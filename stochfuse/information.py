@@ -336,6 +336,8 @@ def unpacked(packed: np.ndarray, sources: Sources) -> Information:
 def check_definite(Y: np.ndarray, step: int, *, rounding: float = 0.0) -> None:
     """Raise NoAnswerError if an information matrix of a step's stack is not positive definite.
 
+    Of a batch (values, items, d, d) the error names the items.
+
     Parameters
     ----------
     rounding : how negative the smallest eigenvalue, scaled to unit diagonal, may be.
@@ -347,9 +349,19 @@ def check_definite(Y: np.ndarray, step: int, *, rounding: float = 0.0) -> None:
     if not fine:
         raise NoAnswerError(
             f"at step {step} the information claimed in some outcome is not positive definite: what is taken for "
-            f"common "
-            "exceeds what is known, and no covariance follows"
+            "common exceeds what is known, and no covariance follows",
+            _indefinite_items(Y, rounding) if Y.ndim == 4 else (),
         )
+
+
+def _indefinite_items(Y: np.ndarray, rounding: float) -> list[int]:
+    diagonal = np.diagonal(Y, axis1=-2, axis2=-1)
+    positive = (diagonal > 0).all(axis=-1)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    finite = np.isfinite(Y).all(axis=(-2, -1), keepdims=True)
+    scaled = np.where(finite, Y, -1.0) * scale[..., :, None]
+    smallest = np.linalg.eigvalsh(scaled * scale[..., None, :])[..., 0]
+    return np.flatnonzero((~positive | (smallest <= -rounding)).any(axis=0)).tolist()
 
 
 def _almost_definite(Y: np.ndarray, rounding: float) -> bool:

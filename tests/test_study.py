@@ -405,6 +405,37 @@ def test_files_of_others_are_left_alone(tmp_path):
         sf.study(asked(), tmp_path / "r.csv")
 
 
+def test_points_that_take_more_for_common_than_there_is_are_known_at_once(monkeypatch):
+    sizes = []
+
+    def spy(scenario, link, noises, *arguments, **settings):
+        sizes.append(len(link))
+        return found(scenario, link, noises, *arguments, **settings)
+
+    found = batches.predict
+    monkeypatch.setattr(evaluation.batches, "predict", spy)
+    ranges = {"model.Q": {"from": 0.1, "to": 100, "scale": "log"}, "model.R": {"from": 1, "to": 1e4, "scale": "log"}}
+    vary = {**ranges, "initial.P": {"from": 1, "to": 1e4, "scale": "log"}, "network.steps": [3]}
+    base = sf.load_scenario("cv-2d").to_mapping()
+    base["network"] |= {"link": 0.5}
+    design = {"kind": "latin-hypercube", "points": 240}
+    plan = load_study({"scenario": base, "vary": vary, "design": design, "predict": {"method": "general"}})
+    answers = evaluation.evaluate(plan, range(240))
+    assert 0 < len(answers.errors) < 24
+    assert len(sizes) <= 4
+    assert sizes[-1] == 240 - len(answers.errors)
+    codes = plan.codes(range(240))
+    for point in (*answers.errors, *[p for p in range(0, 240, 60) if p not in answers.errors]):
+        numbers = {"q": codes["model.Q"][point], "r": codes["model.R"][point], "p0": codes["initial.P"][point]}
+        scenario = sf.load_scenario("cv-2d", steps=3, **{key: float(value) for key, value in numbers.items()})
+        if point in answers.errors:
+            with pytest.raises(sf.NoAnswerError, match="exceeds what is known"):
+                sf.predict(scenario, [0.5], "general")
+        else:
+            value = answers.values[np.repeat(np.arange(240), answers.rows) == point, 0]
+            assert value == pytest.approx(sf.predict(scenario, [0.5], "general").values("rms:x,y")[0], rel=1e-9)
+
+
 def test_a_point_without_an_answer_does_not_take_its_batch_along(monkeypatch):
     sizes = []
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from stochfuse.batches.claims import Claims, Key, Step, claims_of
 from stochfuse.conditioning import NO_DIGIT, MovedSources, change, reach, suspects
-from stochfuse.errors import NotABatchError, StochfuseError
+from stochfuse.errors import NoAnswerError, NotABatchError, StochfuseError
 from stochfuse.information import Sources, estimated, evaluate_atoms, unpacked
 from stochfuse.kalman import Estimate
 from stochfuse.model import Noises
@@ -77,7 +77,8 @@ def moments(
         If they cannot be evaluated together: another estimator, links that differ or are bursty, unlike sensors with
         noises R of their own, a number that is not finite.
     UsageError, NoAnswerError
-        As `stochfuse.general.outcomes`, if that would raise it for one item.
+        As `stochfuse.general.outcomes`, if that would raise it for one item; a NoAnswerError names such items, if not
+        all of them.
     """
     check_batch(scenario, link, noises)
     if estimator not in SUMS:
@@ -94,7 +95,12 @@ def moments(
     # items with the same noises side by side, so that a block of them has few different ones
     order = np.argsort(_distinct(noises)[1], kind="stable")
     blocks = _blocks(claims, scenario, order, errors)
-    found = [_block(claims, scenario, link[some], noises.take(some), errors) for some in blocks]
+    found = []
+    for some in blocks:
+        try:
+            found.append(_block(claims, scenario, link[some], noises.take(some), errors))
+        except NoAnswerError as error:
+            raise NoAnswerError(str(error), some[list(error.items)].tolist()) from None
     parts, rounding = zip(*found, strict=True)
     back = np.argsort(order)
     joined = [None if m[0] is None else np.concatenate(m)[back] for m in zip(*parts, strict=True)]
@@ -148,7 +154,10 @@ def _block(
 ) -> tuple[Moments, np.ndarray]:
     """Moments (items, steps, groups, …), and how far rounding may reach in each item."""
     different, of = _distinct(noises)
-    found, magnified = _over_claims(claims, link, of, _sources(scenario, different, errors), errors)
+    try:
+        found, magnified = _over_claims(claims, link, of, _sources(scenario, different, errors), errors)
+    except NoAnswerError as error:
+        raise NoAnswerError(str(error), np.flatnonzero(np.isin(of, error.items)).tolist()) from None
     far, suspect = 2e-16 * magnified, np.flatnonzero(suspects(scenario, different)[of])
     if len(suspect):
         theirs = Moments(*(None if m is None else m[suspect] for m in found))

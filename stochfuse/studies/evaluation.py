@@ -15,7 +15,7 @@ import numpy as np
 from stochfuse import batches
 from stochfuse.checks import LARGEST, covariance_fault
 from stochfuse.engines.enumeration import TooManyError
-from stochfuse.errors import ScenarioError, StochfuseError
+from stochfuse.errors import NoAnswerError, ScenarioError, StochfuseError
 from stochfuse.messages import message_load
 from stochfuse.methods import predict_several
 from stochfuse.model import Noises
@@ -208,6 +208,12 @@ def _batch(
     try:
         found = batches.predict(unit, link, noises, asked.method, asked.quantities, **asked.settings)
         _fill(asked, found.predictions, items, group)
+    except NoAnswerError as error:
+        without = items[list(error.items)] if error.items else items if len(items) == 1 else items[:0]
+        group.errors.update(dict.fromkeys(without.tolist(), _reason(error)))
+        rest = np.setdiff1d(items, without)
+        parts = [rest] if len(without) else np.array_split(items, 2)
+        return np.concatenate([_batch(asked, unit, numbers, part, group) for part in parts]) if len(rest) else rest
     except TooManyError as error:  # numbers have no say in that
         group.errors.update(dict.fromkeys(items.tolist(), _reason(error)))
         return items[:0]
