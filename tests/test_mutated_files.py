@@ -21,7 +21,7 @@ import stochfuse as sf
 from stochfuse.cli.app import app
 from stochfuse.scenario import parse, preset_names, read_text
 from stochfuse.studies.evaluation import evaluate
-from stochfuse.studies.plan import load_study
+from stochfuse.studies.reading import load_study
 from stochfuse.studies.writing import Columns
 
 EXAMPLES = 500

@@ -14,7 +14,8 @@ import pytest
 import stochfuse as sf
 from stochfuse import batches
 from stochfuse.studies import evaluation
-from stochfuse.studies.plan import load_study, plan_of, put
+from stochfuse.studies.plan import put
+from stochfuse.studies.reading import load_study, plan_of
 from stochfuse.studies.writing import packed, unpacked
 
 THREE = {"network.link": [0.0, 0.3, 1.0], "model.R": [1.0, 100.0], "network.agents": [2, 3]}

@@ -21,8 +21,7 @@ import pytest
 
 import stochfuse as sf
 from stochfuse.cli import main
-from stochfuse.studies import plan as plans
-from stochfuse.studies import running
+from stochfuse.studies import reading, running
 
 AGAIN = "finished points are kept: the same command goes on"
 SCENARIO = """
@@ -387,7 +386,7 @@ def test_a_given_executor_that_breaks_is_not_mended(tmp_path, few):
 
 
 def other_software(record: str, chunk: int) -> tuple[bytes, dict[str, str]]:
-    return b"", {**plans.software(), "numpy": "1.0"}
+    return b"", {**reading.software(), "numpy": "1.0"}
 
 
 def fails(record: str, chunk: int) -> tuple[bytes, dict[str, str]]:

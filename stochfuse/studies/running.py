@@ -29,7 +29,8 @@ from typing import Any
 from stochfuse.errors import StochfuseError, UsageError
 from stochfuse.studies.evaluation import evaluate
 from stochfuse.studies.journal import DamagedError, Journal
-from stochfuse.studies.plan import Plan, load_study, plan_of, software
+from stochfuse.studies.plan import Plan
+from stochfuse.studies.reading import load_study, plan_of, software
 from stochfuse.studies.results import Results
 from stochfuse.studies.writing import check_format, packed, unpacked, write_result
 

@@ -13,7 +13,7 @@
     [report]                                              # what is tabulated
     quantity = ["claimed", "messages"]
 
-Whether the values fit the scenario is found out point by point, see `stochfuse.studies.plan`.
+Whether the values fit the scenario is found out point by point, see `stochfuse.studies.evaluation`.
 """
 
 from __future__ import annotations
