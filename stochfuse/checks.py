@@ -60,6 +60,12 @@ def covariance_fault(array: np.ndarray, *, definite: bool = False) -> str | None
     return "a singular one" if definite and smallest <= 1e-15 else None
 
 
+def first_fault(P: np.ndarray) -> tuple[int, str] | None:
+    """Return the first step whose matrices P[step − 1] are no covariances, and why; see `covariance_fault`."""
+    faults = ((step, covariance_fault(now)) for step, now in enumerate(P, start=1))
+    return next(((step, fault) for step, fault in faults if fault is not None), None)
+
+
 class Checker:
     """Reads values by their path and remembers what was wrong.
 

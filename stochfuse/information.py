@@ -355,18 +355,17 @@ def check_definite(Y: np.ndarray, step: int, *, rounding: float = 0.0) -> None:
 
 
 def _indefinite_items(Y: np.ndarray, rounding: float) -> list[int]:
+    return np.flatnonzero((_smallest(Y) <= -rounding).any(axis=0)).tolist()
+
+
+def _smallest(Y: np.ndarray) -> np.ndarray:
+    """Smallest eigenvalue of each matrix, scaled to unit diagonal; −∞ where it has none."""
     diagonal = np.diagonal(Y, axis1=-2, axis2=-1)
-    positive = (diagonal > 0).all(axis=-1)
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    finite = np.isfinite(Y).all(axis=(-2, -1), keepdims=True)
-    scaled = np.where(finite, Y, -1.0) * scale[..., :, None]
-    smallest = np.linalg.eigvalsh(scaled * scale[..., None, :])[..., 0]
-    return np.flatnonzero((~positive | (smallest <= -rounding)).any(axis=0)).tolist()
+    usable = np.asarray((diagonal > 0).all(axis=-1) & np.isfinite(Y).all(axis=(-2, -1)))
+    scale = 1.0 / np.sqrt(np.where(usable[..., None], diagonal, 1.0))
+    scaled = np.where(usable[..., None, None], Y, 0.0) * scale[..., :, None] * scale[..., None, :]
+    return np.where(usable, np.linalg.eigvalsh(scaled)[..., 0], -np.inf)
 
 
 def _almost_definite(Y: np.ndarray, rounding: float) -> bool:
-    diagonal = np.diagonal(Y, axis1=-2, axis2=-1)
-    if not (diagonal > 0).all():
-        return False
-    scale = 1.0 / np.sqrt(diagonal)
-    return bool((np.linalg.eigvalsh(Y * scale[..., :, None] * scale[..., None, :]) > -rounding).all())
+    return bool((_smallest(Y) > -rounding).all())

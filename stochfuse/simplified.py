@@ -36,7 +36,7 @@ import numpy as np
 from stochfuse.algebra import NUMPY, Algebra, inverse
 from stochfuse.arrivals import Counts, like_senders, poisson_binomial
 from stochfuse.averaged import sound
-from stochfuse.checks import covariance_fault
+from stochfuse.checks import first_fault
 from stochfuse.engines.mean_field import COMMON, Case, Outcomes, run, run_like
 from stochfuse.errors import StochfuseError, UsageError
 from stochfuse.kalman import Estimate, from_information, to_information, update, update_information
@@ -160,14 +160,12 @@ def faults(P: np.ndarray) -> dict[int, str]:
     fine = sound(P[-1]) & (np.diagonal(P, axis1=1, axis2=2) >= 0).all(axis=(0, 2))
     found: dict[int, str] = {}
     for item in np.flatnonzero(~fine):
-        for step, now in enumerate(P[..., item], start=1):
-            if not np.isfinite(now).all():
-                found[int(item)] = f"the covariance at step {step} is not finite: it grows beyond floating point"
-                break
-            fault = covariance_fault(now)
-            if fault is not None:
-                found[int(item)] = f"expected a covariance at step {step}, got {fault}"
-                break
+        first = first_fault(P[..., item])
+        if first is not None:
+            step, fault = first
+            lost = f"the covariance at step {step} is not finite: it grows beyond floating point"
+            fine_at = np.isfinite(P[step - 1, ..., item]).all()
+            found[int(item)] = f"expected a covariance at step {step}, got {fault}" if fine_at else lost
     return found
 
 

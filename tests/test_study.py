@@ -43,6 +43,19 @@ def expected(row, scenario="thesis-transient", quantity="claimed", metric="trace
     return p.values(metric)[0, int(row["step"]) - 1]
 
 
+@pytest.fixture
+def sizes(monkeypatch):
+    """Sizes of the batches that are predicted."""
+    sizes, predict = [], batches.predict
+
+    def spy(scenario, link, noises, *arguments, **settings):
+        sizes.append(len(link))
+        return predict(scenario, link, noises, *arguments, **settings)
+
+    monkeypatch.setattr(evaluation.batches, "predict", spy)
+    return sizes
+
+
 # what is asked
 
 
@@ -213,22 +226,14 @@ def test_every_row_is_what_predict_says(tmp_path, scenario, vary, quantity, metr
         assert float(row[f"{quantity}.{metric}"]) == pytest.approx(want, rel=1e-10)
 
 
-def test_like_points_are_one_batch(monkeypatch):
-    calls = []
-
-    def spy(scenario, link, noises, *arguments, **settings):
-        calls.append(len(link))
-        return found(scenario, link, noises, *arguments, **settings)
-
-    found = batches.predict
-    monkeypatch.setattr(evaluation.batches, "predict", spy)
+def test_like_points_are_one_batch(sizes):
     values = {"from": 1, "to": 10, "number": 10}
     vary = {"model.Q": values, "network.agents": [2, 3], "network.link": [0.1, 0.5], "model.R": values}
     vary["network.steps"] = [3]
     for method in ("simplified", "general", "optimal"):
         plan = load_study(asked(vary, predict={"method": method}))
         evaluation.evaluate(plan, range(plan.size))
-    assert calls == [200, 200] * 3
+    assert sizes == [200, 200] * 3
 
 
 def test_unlike_agents_and_matrices_are_answered_one_by_one(tmp_path):
@@ -406,15 +411,7 @@ def test_files_of_others_are_left_alone(tmp_path):
         sf.study(asked(), tmp_path / "r.csv")
 
 
-def test_points_that_take_more_for_common_than_there_is_are_known_at_once(monkeypatch):
-    sizes = []
-
-    def spy(scenario, link, noises, *arguments, **settings):
-        sizes.append(len(link))
-        return found(scenario, link, noises, *arguments, **settings)
-
-    found = batches.predict
-    monkeypatch.setattr(evaluation.batches, "predict", spy)
+def test_points_that_take_more_for_common_than_there_is_are_known_at_once(sizes):
     ranges = {"model.Q": {"from": 0.1, "to": 100, "scale": "log"}, "model.R": {"from": 1, "to": 1e4, "scale": "log"}}
     vary = {**ranges, "initial.P": {"from": 1, "to": 1e4, "scale": "log"}, "network.steps": [3]}
     base = sf.load_scenario("cv-2d").to_mapping()
@@ -437,15 +434,7 @@ def test_points_that_take_more_for_common_than_there_is_are_known_at_once(monkey
             assert value == pytest.approx(sf.predict(scenario, [0.5], "general").values("rms:x,y")[0], rel=1e-9)
 
 
-def test_a_point_without_an_answer_does_not_take_its_batch_along(monkeypatch):
-    sizes = []
-
-    def spy(scenario, link, noises, *arguments, **settings):
-        sizes.append(len(link))
-        return found(scenario, link, noises, *arguments, **settings)
-
-    found = batches.predict
-    monkeypatch.setattr(evaluation.batches, "predict", spy)
+def test_a_point_without_an_answer_does_not_take_its_batch_along(sizes):
     variances = [float(P) for P in range(1, 33)]
     variances[5] = 0.0  # the Local Fusion Graph needs its inverse
     vary = {"network.link": [0.5], "network.steps": [2], "initial.P": variances}

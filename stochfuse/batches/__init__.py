@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.batches import general, optimum, simplified
-from stochfuse.checks import covariance_fault
-from stochfuse.conditioning import told as rounded
-from stochfuse.engines.rounding import PROMISED as EXACT
+from stochfuse.checks import covariance_fault, first_fault
+from stochfuse.conditioning import told
+from stochfuse.engines.rounding import PROMISED
 from stochfuse.errors import NotABatchError
 from stochfuse.methods import LFG, MOST_GRAPHS, group_of
 from stochfuse.model import Noises
@@ -44,7 +44,7 @@ class _Found(NamedTuple):
     moments: Moments
     group_of: np.ndarray
     estimator: str
-    natures: np.ndarray
+    exact: np.ndarray
     faults: dict[int, str]
 
 
@@ -84,8 +84,7 @@ def predict(
         asked = [q for q in quantities if ways[q] == way]
         found[way] = _found(scenario, link, noises, way, asked, settings)
     predictions = [_prediction(scenario, link, ways[q], q, found[ways[q]]) for q in quantities]
-    natures = np.where([f.natures == "exact" for f in found.values()], "exact", "approximate")
-    natures = np.where((natures == "exact").all(axis=0), "exact", "approximate")
+    natures = np.where(np.all([f.exact for f in found.values()], axis=0), "exact", "approximate")
     return Batch(predictions, natures, {k: v for f in found.values() for k, v in f.faults.items()})
 
 
@@ -100,7 +99,7 @@ def _found(
             )
         P, _, faults = simplified.covariances(scenario, link, noises)
         everyone = np.zeros(scenario.network.agents, dtype=int)
-        return _Found(Moments(P[:, :, None]), everyone, "broadcast-prior", _natures(len(link), "approximate"), faults)
+        return _Found(Moments(P[:, :, None]), everyone, "broadcast-prior", np.zeros(len(link), dtype=bool), faults)
     if method == "optimal":
         best = optimum.moments(scenario, link, noises, errors=errors)
         of, groups, estimator = best.moments, best.groups, "optimal"
@@ -113,13 +112,8 @@ def _found(
         rounding = every.rounding
     else:
         raise NotABatchError(f"a batch: expected method simplified, general, naive or optimal, got {method}")
-    natures = np.where(rounding > EXACT, "approximate", "exact")
-    faults = {int(i): rounded(rounding[i]) for i in np.flatnonzero(rounding > WORTHLESS)}
-    return _Found(of, group_of(groups), estimator, natures, {**_faults(of), **faults})
-
-
-def _natures(items: int, nature: str) -> np.ndarray:
-    return np.full(items, nature)
+    faults = {int(i): told(rounding[i]) for i in np.flatnonzero(rounding > WORTHLESS)}
+    return _Found(of, group_of(groups), estimator, ~(rounding > PROMISED), {**_faults(of), **faults})
 
 
 def _faults(moments: Moments) -> dict[int, str]:
@@ -128,10 +122,9 @@ def _faults(moments: Moments) -> dict[int, str]:
     for name, M in (("claimed", moments.P), ("actual", moments.actual)):
         if M is None or covariance_fault(M) is None:
             continue
-        for item, step in np.ndindex(M.shape[:2]):
-            fault = covariance_fault(M[item, step])
-            if fault is not None:
-                found.setdefault(item, f"the {name} covariance at step {step + 1} is {fault}")
+        for item, first in enumerate(map(first_fault, M)):
+            if first is not None:
+                found.setdefault(item, f"the {name} covariance at step {first[0]} is {first[1]}")
     return found
 
 
@@ -141,7 +134,7 @@ def _prediction(scenario: Scenario, link: np.ndarray, method: str, quantity: str
         method=method,
         quantity="optimal" if method == "optimal" and quantity == "claimed" else quantity,
         stage="posterior",
-        nature="exact" if (found.natures == "exact").all() else "approximate",
+        nature="exact" if found.exact.all() else "approximate",
         link=link,
         cases=None,
         steps=np.arange(1, scenario.network.steps + 1),

@@ -13,6 +13,7 @@ import numpy as np
 
 from stochfuse import simplified
 from stochfuse.averaged import noise_factor
+from stochfuse.conditioning import told
 from stochfuse.engines.mean_field import BLOCK, Case, run_like
 from stochfuse.engines.rounding import definite, lost, rounding
 from stochfuse.errors import UsageError
@@ -114,7 +115,4 @@ def _imprecise(case: Case, items: np.ndarray, P: np.ndarray) -> dict[int, str]:
     if not items.size:
         return {}
     reach = rounding(case.take(items), P[..., items])
-    return {
-        int(item): f"ill-conditioned: rounding may reach a relative {error:.0e}, in units of the standard deviations"
-        for item, error in zip(items[lost(reach)], reach[lost(reach)], strict=True)
-    }
+    return {int(item): told(error) for item, error in zip(items[lost(reach)], reach[lost(reach)], strict=True)}

@@ -20,15 +20,15 @@ Where paths are too many, `stochfuse.engines.enclosure` gives bounds.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from stochfuse.engines.contacts import Contacts
+from stochfuse.engines.numbers import AsTheyAre, Numbers
 from stochfuse.errors import UsageError
 from stochfuse.kalman import (
     Estimate,
-    factor,
     from_factor,
     posterior_gain,
     predict,
@@ -53,38 +53,6 @@ class Carried(NamedTuple):
 
     x: Any
     root: np.ndarray
-
-
-class Numbers(Protocol):
-    """What the square-root form's numbers go through, as in `stochfuse.engines.mean_field.SquareRoot`."""
-
-    def factor(self, P: np.ndarray) -> np.ndarray:
-        """Square root of a given covariance."""
-        ...
-
-    def rounded(self, L: np.ndarray) -> np.ndarray:
-        """Return a factor that has been computed, or another matrix with errors of rounding."""
-        ...
-
-    def noise(self, R: np.ndarray) -> np.ndarray:
-        """Return a given noise covariance, which is about to be factored."""
-        ...
-
-
-class AsTheyAre:
-    """Numbers as they are; `stochfuse.engines.rounding.Moving` moves them."""
-
-    def factor(self, P: np.ndarray) -> np.ndarray:
-        """Square root of a given covariance."""
-        return factor(P)
-
-    def rounded(self, L: np.ndarray) -> np.ndarray:
-        """Return the same."""
-        return L
-
-    def noise(self, R: np.ndarray) -> np.ndarray:
-        """Return the same."""
-        return R
 
 
 class Filter(NamedTuple):

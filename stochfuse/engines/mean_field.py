@@ -30,6 +30,7 @@ from stochfuse.averaged import (
     update_scalar,
     upper,
 )
+from stochfuse.engines.numbers import AsTheyAre, Numbers
 from stochfuse.kalman import (
     Information,
     factor,
@@ -242,34 +243,27 @@ def _prior_parts(model: Model, sensor: Sensor, step: int, whiten: bool) -> tuple
 class SquareRoot:
     """Factors L of P = L Lᵀ, shape (items, d, d).
 
-    What it rounds goes through `factor`, `rounded` and `noise`, which `stochfuse.engines.rounding` replaces.
+    Parameters
+    ----------
+    case : what the recursion needs.
+    numbers : what its numbers go through.
     """
 
-    def __init__(self, case: Case):
-        self.case = case
-
-    def factor(self, P: np.ndarray) -> np.ndarray:
-        """Square root of a given covariance."""
-        return factor(P)
-
-    def rounded(self, L: np.ndarray) -> np.ndarray:
-        """Return a factor that has been computed."""
-        return L
-
-    def noise(self, R: np.ndarray) -> np.ndarray:
-        """Return a given noise covariance, which is about to be factored."""
-        return R
+    def __init__(self, case: Case, numbers: Numbers = AsTheyAre()):  # noqa: B008
+        self.case, self.numbers = case, numbers
 
     def start(self) -> Carried:
         share, P0 = np.sqrt(self.case.first_share()), self.case.noises.P0
-        return Carried(self.factor(self.case.P0 if P0 is None else P0) * share[:, None, None], np.ones(self.case.items))
+        return Carried(
+            self.numbers.factor(self.case.P0 if P0 is None else P0) * share[:, None, None], np.ones(self.case.items)
+        )
 
     def advance(self, carried: Carried, step: int) -> Carried:
         model, sensor, arrivals = self.case.model, self.case.sensor, self.case.arrivals[step - 1]
         Q, R, _ = self.case.noises
-        Q = self.factor(at_step(model.Q, step) if Q is None else Q)
-        R = self.noise(at_step(sensor.R, step) if R is None else R)
-        prior = self.rounded(predict_factor(self.rounded(carried.value), at_step(model.F, step), Q))
+        Q = self.numbers.factor(at_step(model.Q, step) if Q is None else Q)
+        R = self.numbers.noise(at_step(sensor.R, step) if R is None else R)
+        prior = self.numbers.rounded(predict_factor(self.numbers.rounded(carried.value), at_step(model.F, step), Q))
 
         def shrink(s: np.ndarray) -> np.ndarray:
             # a ratio beyond floating point would leave nothing, whatever R is

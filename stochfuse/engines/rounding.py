@@ -14,6 +14,8 @@ The same ε serve all items, so that an item's answer does not depend on its com
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from stochfuse.engines.mean_field import BLOCK, Case, SquareRoot, run
@@ -25,17 +27,36 @@ DRAWS = 3
 PROMISED = 1e-9
 """Largest relative error that is called none: where thrice the change is more, digits are lost."""
 
+MOVE = 8
+"""Ulps by which numbers are moved, unless it is said otherwise."""
+
 _ULP = 2.0**-52
 
 
-class _Moved(SquareRoot):
-    """The square-root form with all its numbers moved."""
+def ulps(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Relative errors of `MOVE` ulps, more or less, up or down: none so small that it is rounded away."""
+    return rng.choice([-_ULP, _ULP], size=shape) * rng.uniform(0.5 * MOVE, 1.5 * MOVE, size=shape)
 
-    def __init__(self, case: Case, seed: int):
-        super().__init__(case)
-        self._rng = np.random.default_rng(seed)
+
+def within_an_ulp(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Relative errors of up to an ulp, up or down."""
+    return _ULP * rng.uniform(-1.0, 1.0, size=shape)
+
+
+class Moving:
+    """What moves the numbers of a recursion in square-root form, see `stochfuse.engines.numbers.Numbers`.
+
+    Parameters
+    ----------
+    seed : of the errors.
+    errors : draws relative errors of a shape.
+    """
+
+    def __init__(self, seed: int, errors: Callable[[np.random.Generator, tuple[int, ...]], np.ndarray] = ulps) -> None:
+        self._rng, self._draw = np.random.default_rng(seed), errors
 
     def factor(self, P: np.ndarray) -> np.ndarray:
+        """Square root of a covariance, moved as rounding of its decomposition moves it."""
         L = factor(P)
         sd = np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))[..., None]
         # the row of a column's pivot has the largest variance that the columns before it left
@@ -47,9 +68,11 @@ class _Moved(SquareRoot):
         return L + np.where(L != 0, sd * grown, 0.0) * self._errors(L)
 
     def rounded(self, L: np.ndarray) -> np.ndarray:
+        """Return a matrix with each entry moved."""
         return L * (1.0 + self._errors(L))
 
     def noise(self, R: np.ndarray) -> np.ndarray:
+        """Return a covariance with each entry moved."""
         errors = np.triu(self._errors(R))
         moved = R * (1.0 + errors + np.triu(errors, 1).T)
         # one that is no longer definite has no digits to lose: without its correlations it will show
@@ -57,7 +80,7 @@ class _Moved(SquareRoot):
         return np.where(definite(moved)[..., None, None], moved, alone)
 
     def _errors(self, M: np.ndarray) -> np.ndarray:
-        return _ULP * self._rng.uniform(-1.0, 1.0, size=M.shape[-2:])
+        return self._draw(self._rng, M.shape[-2:])
 
 
 def definite(R: np.ndarray) -> np.ndarray:
@@ -90,7 +113,7 @@ def rounding(case: Case, P: np.ndarray) -> np.ndarray:
         moved = np.empty_like(given)
         with np.errstate(all="ignore"):
             for seed in range(DRAWS):
-                run(_Moved(part, seed), len(P), moved)
+                run(SquareRoot(part, Moving(seed, within_an_ulp)), len(P), moved)
                 reach[block] = np.maximum(reach[block], (np.abs(moved - given) / unit).max(axis=(0, 1, 2)))
     return reach
 
@@ -98,22 +121,3 @@ def rounding(case: Case, P: np.ndarray) -> np.ndarray:
 def lost(reach: np.ndarray) -> np.ndarray:
     """Whether more than `PROMISED` may be lost, from what `rounding` returns."""
     return ~(3.0 * reach <= PROMISED)
-
-
-class Moving(_Moved):
-    """What moves the numbers of another recursion in square-root form than the mean field's."""
-
-    def __init__(self, seed: int):
-        self._rng = np.random.default_rng(seed)
-
-    def _errors(self, M: np.ndarray) -> np.ndarray:
-        return ulps(self._rng, M.shape[-2:])
-
-
-def ulps(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Relative errors of `MOVE` ulps, more or less, up or down: none so small that it is rounded away."""
-    return rng.choice([-_ULP, _ULP], size=shape) * rng.uniform(0.5 * MOVE, 1.5 * MOVE, size=shape)
-
-
-MOVE = 8
-"""Ulps by which `Moving` moves numbers."""

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse import batches
-from stochfuse.checks import LARGEST, covariance_fault
+from stochfuse.checks import LARGEST, covariance_fault, first_fault
+from stochfuse.conditioning import told
 from stochfuse.engines.enumeration import TooManyError
 from stochfuse.errors import NoAnswerError, ScenarioError, StochfuseError
 from stochfuse.messages import message_load
@@ -136,16 +137,38 @@ def _together(plan: Plan, points: range, found: Sequence[tuple[np.ndarray, _Grou
 
 
 class _Asked(NamedTuple):
-    """How the points of a group are predicted."""
+    """The points of a group, how they are predicted, and what becomes of them.
+
+    Parameters
+    ----------
+    plan, method, settings : how.
+    mapping : the scenario that they have in common.
+    unit : the same with 1 for the numbers in which they differ: with their shapes, and the identities that numbers are
+        multiples of.
+    numbers : those numbers, (points,) by key.
+    group : the answers.
+    """
 
     plan: Plan
     method: str
     settings: Mapping[str, Any]
+    mapping: Mapping[str, Any]
+    unit: Scenario
+    numbers: Mapping[str, np.ndarray]
+    group: _Group
 
     @property
     def quantities(self) -> list[str]:
         """Quantities of the error."""
         return [q for q in self.plan.quantities if q != MESSAGES]
+
+    def scenario(self, numbers: Mapping[str, float]) -> Scenario:
+        """Make a scenario of some numbers."""
+        return Scenario.from_mapping(put(self.mapping, numbers), self.plan.scenario_name)
+
+    def fail(self, items: np.ndarray, error: Exception) -> None:
+        """Note why some points have no answer."""
+        self.group.errors.update(dict.fromkeys(items.tolist(), _reason(error)))
 
 
 def _group(plan: Plan, values: Mapping[str, Any], numbers: Mapping[str, np.ndarray], size: int) -> _Group:
@@ -153,23 +176,21 @@ def _group(plan: Plan, values: Mapping[str, Any], numbers: Mapping[str, np.ndarr
     keys = {path: value for path, value in values.items() if path not in SETTINGS}
     settings = {**plan.settings, **{name: value for name, value in values.items() if name in SETTINGS}}
     method = settings.pop("method", None) or default_method(plan.example, set(settings))
-    settings = {"workers": 1, **settings}
-    asked = _Asked(plan, method, settings)
     kind = (method, "", "")
     try:
         mapping = put(plan.base, keys)
-        # noises of 1 have the shapes, and the identities that numbers are multiples of
         unit = Scenario.from_mapping(put(mapping, dict.fromkeys(numbers, 1.0)), plan.scenario_name)
     except StochfuseError as error:
         failed = _Group.empty(size, 0, len(plan.columns), kind)
         failed.errors.update(dict.fromkeys(range(size), _reason(error)))
         return failed
     group = _Group.empty(size, unit.network.steps, len(plan.columns), kind)
+    asked = _Asked(plan, method, {"workers": 1, **settings}, mapping, unit, numbers, group)
     inside = _inside(numbers, size)
-    rest = _batch(asked, unit, numbers, np.flatnonzero(inside), group) if inside.any() else np.arange(0)
-    _by_noises(asked, mapping, numbers, np.union1d(rest, np.flatnonzero(~inside)), group)
+    rest = _batch(asked, np.flatnonzero(inside)) if inside.any() else np.arange(0)
+    _by_noises(asked, np.union1d(rest, np.flatnonzero(~inside)))
     if MESSAGES in plan.quantities:
-        _messages(asked, unit, numbers, group)
+        _messages(asked)
     return group
 
 
@@ -191,10 +212,9 @@ def _inside(numbers: Mapping[str, np.ndarray], size: int) -> np.ndarray:
     return fine
 
 
-def _batch(
-    asked: _Asked, unit: Scenario, numbers: Mapping[str, np.ndarray], items: np.ndarray, group: _Group
-) -> np.ndarray:
+def _batch(asked: _Asked, items: np.ndarray) -> np.ndarray:
     """Evaluate items in one batch, or in as few as it takes to part those without an answer; return these."""
+    unit, numbers, group = asked.unit, asked.numbers, asked.group
 
     def times(path: str, M: np.ndarray) -> np.ndarray | None:
         return numbers[path][items][:, None, None] * M if path in numbers else None
@@ -207,21 +227,20 @@ def _batch(
     noises = Noises(times(Q, unit.model.Q), times(R, unit.sensors[0].R), times(P0, unit.P0))
     try:
         found = batches.predict(unit, link, noises, asked.method, asked.quantities, **asked.settings)
-        _fill(asked, found.predictions, items, group)
-    except NoAnswerError as error:
-        without = items[list(error.items)] if error.items else items if len(items) == 1 else items[:0]
-        group.errors.update(dict.fromkeys(without.tolist(), _reason(error)))
-        rest = np.setdiff1d(items, without)
-        parts = [rest] if len(without) else np.array_split(items, 2)
-        return np.concatenate([_batch(asked, unit, numbers, part, group) for part in parts]) if len(rest) else rest
+        _fill(asked, found.predictions, items)
     except TooManyError as error:  # numbers have no say in that
-        group.errors.update(dict.fromkeys(items.tolist(), _reason(error)))
+        asked.fail(items, error)
         return items[:0]
-    except Exception:
-        if len(items) == 1:
+    except Exception as error:
+        without = items[list(error.items)] if isinstance(error, NoAnswerError) else items[:0]
+        if len(without):
+            asked.fail(without, error)
+            parts = [np.setdiff1d(items, without)]
+        elif len(items) == 1:
             return items
-        halves = np.array_split(items, 2)
-        return np.concatenate([_batch(asked, unit, numbers, half, group) for half in halves])
+        else:
+            parts = np.array_split(items, 2)
+        return np.concatenate([items[:0], *(_batch(asked, part) for part in parts if len(part))])
     for place, reason in found.faults.items():
         group.errors[int(items[place])] = reason
     for nature in ("exact", "approximate"):
@@ -235,81 +254,65 @@ def _common_link(scenario: Scenario) -> float | None:
     return None if link is None or link.ndim or scenario.network.burst is not None else float(link)
 
 
-def _by_noises(
-    asked: _Asked, mapping: Mapping[str, Any], numbers: Mapping[str, np.ndarray], items: np.ndarray, group: _Group
-) -> None:
+def _by_noises(asked: _Asked, items: np.ndarray) -> None:
     """Evaluate items, those of equal noises together."""
+    numbers = asked.numbers
     noises = [path for path in numbers if path != LINK]
-    alone = asked.method == "monte-carlo" or asked.settings.get("prune", False)
     for members in _alike([numbers[path][items] for path in noises], len(items)) if len(items) else []:
         some = items[members]
+        possible = _inside({LINK: numbers[LINK][some]}, len(some)) if LINK in numbers else np.ones(len(some), bool)
         values = {path: float(numbers[path][some[0]]) for path in noises}
-        some = _possible(asked, mapping, values, numbers, some, group)
-        if len(some) and (alone or not _several(asked, mapping, values, numbers, some, group)):
-            for item in some:
-                _several(asked, mapping, values, numbers, np.array([item]), group)
+        if possible.any():
+            _of_noises(asked, values, some[possible])
+        for item in some[~possible]:
+            try:
+                asked.scenario({**values, LINK: float(numbers[LINK][item])})
+            except StochfuseError as error:
+                asked.fail(np.array([item]), error)
 
 
-def _possible(
-    asked: _Asked,
-    mapping: Mapping[str, Any],
-    values: Mapping[str, float],
-    numbers: Mapping[str, np.ndarray],
-    items: np.ndarray,
-    group: _Group,
-) -> np.ndarray:
-    """Items that are left where equal noises make no scenario: those whose link probability is at fault as well."""
-    if LINK not in numbers:
-        return items
+def _of_noises(asked: _Asked, values: Mapping[str, float], items: np.ndarray) -> None:
+    """Evaluate items of equal noises, together if that has an answer, else one by one."""
     try:
-        Scenario.from_mapping(put(mapping, {**values, LINK: 0.5}), asked.plan.scenario_name)
+        # what its own link probability is does not matter: the items' are predicted
+        scenario = asked.scenario({**values, LINK: 0.5} if LINK in asked.numbers else values)
     except StochfuseError as error:
-        inside = _inside({LINK: numbers[LINK][items]}, len(items))
-        group.errors.update(dict.fromkeys(items[inside].tolist(), _reason(error)))
-        return items[~inside]
-    return items
+        asked.fail(items, error)
+        return
+    alone = asked.method == "monte-carlo" or asked.settings.get("prune", False)
+    if alone or not _several(asked, scenario, items):
+        for item in items:
+            _several(asked, scenario, np.array([item]))
 
 
-def _several(
-    asked: _Asked,
-    mapping: Mapping[str, Any],
-    values: Mapping[str, float],
-    numbers: Mapping[str, np.ndarray],
-    items: np.ndarray,
-    group: _Group,
-) -> bool:
-    """Predict items of equal noises; what is wrong with a single one is its error."""
+def _several(asked: _Asked, scenario: Scenario, items: np.ndarray) -> bool:
+    """Predict items of one scenario; what is wrong with a single one is its error."""
+    links, rows = None, np.zeros(len(items), dtype=int)
+    if LINK in asked.numbers:
+        links, rows = np.unique(asked.numbers[LINK][items], return_inverse=True)
     try:
-        if LINK not in numbers:
-            scenario = Scenario.from_mapping(put(mapping, values), asked.plan.scenario_name)
-            links, rows = None, np.zeros(len(items), dtype=int)
-        else:
-            given, rows = np.unique(numbers[LINK][items], return_inverse=True)
-            first = {LINK: float(given[0])}
-            scenario = Scenario.from_mapping(put(mapping, {**values, **first}), asked.plan.scenario_name)
-            links = given.tolist()
         # what the optimum claims is the optimum
         names = ["optimal" if asked.method == "optimal" and q == "claimed" else q for q in asked.quantities]
         different = list(dict.fromkeys(names))
         several = predict_several(scenario, links, asked.method, different, **asked.settings)
         found = [several[different.index(name)] for name in names]
-        _fill(asked, found, items, group, rows)
+        _fill(asked, found, items, rows)
     except Exception as error:
         if len(items) > 1:
             return False
-        group.errors[int(items[0])] = _reason(error)
+        asked.fail(items, error)
         return True
-    group.mark(items, _kind(asked, found))
+    asked.group.mark(items, _kind(asked, found))
     for p in found:
-        _check(p, rows, items, group)
+        _check(p, rows, items, asked.group)
     return True
 
 
 def _fill(
-    asked: _Asked, found: Sequence[Prediction], items: np.ndarray, group: _Group, rows: np.ndarray | slice = slice(None)
+    asked: _Asked, found: Sequence[Prediction], items: np.ndarray, rows: np.ndarray | slice = slice(None)
 ) -> None:
     """Write the value columns of items, and note what is not finite."""
-    plan = asked.plan
+    plan, group = asked.plan, asked.group
     for quantity, p in zip(asked.quantities, found, strict=True):
         for m in map(plan.metric, plan.metrics):
             name = f"{quantity}.{m.name}"
@@ -327,29 +330,25 @@ def _fill(
 def _kind(asked: _Asked, found: Sequence[Prediction]) -> Kind:
     """Return method, estimator and nature of answers: of several quantities the nature of the least certain."""
     certain = ("exact", "sampled", "approximate", "bound")
-    natures = [
-        "approximate" if p.outcomes is not None and p.outcomes.rounding > batches.EXACT else p.nature for p in found
-    ]
     own = next((p for p in found if p.quantity != "optimal"), found[0])
-    return asked.method, own.estimator, max(natures, key=certain.index)
+    return asked.method, own.estimator, max((p.nature for p in found), key=certain.index)
 
 
 def _check(p: Prediction, rows: np.ndarray, items: np.ndarray, group: _Group) -> None:
     """Note as its points' error what is no answer: an indefinite covariance, or one that is rounding."""
     if p.outcomes is not None and p.outcomes.rounding > batches.WORTHLESS:
-        group.errors.update(dict.fromkeys(items.tolist(), batches.rounded(p.outcomes.rounding)))
+        group.errors.update(dict.fromkeys(items.tolist(), told(p.outcomes.rounding)))
     P = p.moments.P[rows]
     if covariance_fault(P) is None:
         return
-    for place, item in enumerate(items):
-        for step in range(P.shape[1]):
-            fault = covariance_fault(P[place, step])
-            if fault is not None:
-                group.errors.setdefault(int(item), f"the covariance at step {step + 1} is {fault}")
+    for item, first in zip(items, map(first_fault, P), strict=True):
+        if first is not None:
+            group.errors.setdefault(int(item), f"the covariance at step {first[0]} is {first[1]}")
 
 
-def _messages(asked: _Asked, unit: Scenario, numbers: Mapping[str, np.ndarray], group: _Group) -> None:
+def _messages(asked: _Asked) -> None:
     """Write the expected message load, which depends on the network alone."""
+    group, numbers = asked.group, asked.numbers
     column = asked.plan.columns.index(NODES)
     fine = np.setdiff1d(np.arange(len(group.what)), list(group.errors))
     if not len(fine):
@@ -362,9 +361,9 @@ def _messages(asked: _Asked, unit: Scenario, numbers: Mapping[str, np.ndarray], 
         if not len(some):
             continue
         try:
-            load = _load(unit, links, estimator, asked.plan.agent)
+            load = _load(asked.unit, links, estimator, asked.plan.agent)
         except Exception as error:
-            group.errors.update(dict.fromkeys(fine[some].tolist(), _reason(error)))
+            asked.fail(fine[some], error)
         else:
             group.values[fine[some], :, column] = load[rows[some]]
 
