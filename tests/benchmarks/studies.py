@@ -59,7 +59,7 @@ def promised(quick: bool) -> list[tuple[str, ...]]:
         took, peak, _ = run(latin(points), workers)
         name = f"simplified, scalar, n = 3, 5 steps: {points:,} points, {workers} worker{'s' * (workers > 1)}"
         rows.append((name, f"{took:.3g} s", f"{peak:.0f} MB", f"{points / took:,.0f}/s", "20 s, 1 GB"))
-    points = 200 if quick else 20_000
+    points = 200 if quick else 80_000
     minute = latin(points, scenario="cv-2d", predict={"method": "general"})
     minute["vary"] = {**NOISES, "network.steps": [3]}
     times = [run(minute, workers) for workers in (1, 2)]
