@@ -17,67 +17,67 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from stochfuse.comparison import Comparison as Comparison
-    from stochfuse.comparison import compare as compare
-    from stochfuse.comparison import compare_estimators as compare_estimators
-    from stochfuse.crosscheck import check_results as check_results
     from stochfuse.errors import NoAnswerError as NoAnswerError
     from stochfuse.errors import ScenarioError as ScenarioError
     from stochfuse.errors import StochfuseError as StochfuseError
     from stochfuse.errors import UsageError as UsageError
-    from stochfuse.fusion_graph import FusionGraph as FusionGraph
-    from stochfuse.fusion_graph import load_history as load_history
-    from stochfuse.inverse.agents_needed import AgentsNeeded as AgentsNeeded
-    from stochfuse.inverse.agents_needed import agents_needed as agents_needed
-    from stochfuse.inverse.least_link import LeastLink as LeastLink
-    from stochfuse.inverse.least_link import least_link as least_link
-    from stochfuse.inverse.sensitivity import Sensitivity as Sensitivity
-    from stochfuse.inverse.sensitivity import sensitivity as sensitivity
-    from stochfuse.inverse.sensitivity import share_of_gain as share_of_gain
-    from stochfuse.messages import MessageLoad as MessageLoad
-    from stochfuse.messages import message_load as message_load
-    from stochfuse.methods import predict as predict
-    from stochfuse.prediction import Prediction as Prediction
-    from stochfuse.questions import steady_state as steady_state
-    from stochfuse.results import read_results as read_results
-    from stochfuse.scenario import Scenario as Scenario
-    from stochfuse.scenario import load_scenario as load_scenario
-    from stochfuse.states import predict_states as predict_states
+    from stochfuse.estimators.fusion_graph import FusionGraph as FusionGraph
+    from stochfuse.estimators.fusion_graph import load_history as load_history
+    from stochfuse.prediction.compare import Comparison as Comparison
+    from stochfuse.prediction.compare import compare as compare
+    from stochfuse.prediction.compare import compare_estimators as compare_estimators
+    from stochfuse.prediction.predict import predict as predict
+    from stochfuse.prediction.result import Prediction as Prediction
+    from stochfuse.prediction.states import predict_states as predict_states
+    from stochfuse.prediction.steady_state import steady_state as steady_state
+    from stochfuse.questions.agents_needed import AgentsNeeded as AgentsNeeded
+    from stochfuse.questions.agents_needed import agents_needed as agents_needed
+    from stochfuse.questions.crosscheck import check_results as check_results
+    from stochfuse.questions.least_link import LeastLink as LeastLink
+    from stochfuse.questions.least_link import least_link as least_link
+    from stochfuse.questions.messages import MessageLoad as MessageLoad
+    from stochfuse.questions.messages import message_load as message_load
+    from stochfuse.questions.results import read_results as read_results
+    from stochfuse.questions.sensitivity import Sensitivity as Sensitivity
+    from stochfuse.questions.sensitivity import sensitivity as sensitivity
+    from stochfuse.questions.sensitivity import share_of_gain as share_of_gain
+    from stochfuse.scenario.scenario import Scenario as Scenario
+    from stochfuse.scenario.scenario import load_scenario as load_scenario
     from stochfuse.studies.running import study as study
-    from stochfuse.symbolic import derive_simplified as derive_simplified
-    from stochfuse.symbolic_general import derive_general as derive_general
-    from stochfuse.symbolic_optimal import derive_optimal as derive_optimal
+    from stochfuse.symbolic.general import derive_general as derive_general
+    from stochfuse.symbolic.optimal import derive_optimal as derive_optimal
+    from stochfuse.symbolic.simplified import derive_simplified as derive_simplified
 
 _HOME = {
-    "AgentsNeeded": "inverse.agents_needed",
-    "Comparison": "comparison",
-    "FusionGraph": "fusion_graph",
-    "LeastLink": "inverse.least_link",
-    "MessageLoad": "messages",
+    "AgentsNeeded": "questions.agents_needed",
+    "Comparison": "prediction.compare",
+    "FusionGraph": "estimators.fusion_graph",
+    "LeastLink": "questions.least_link",
+    "MessageLoad": "questions.messages",
     "NoAnswerError": "errors",
-    "Prediction": "prediction",
-    "Scenario": "scenario",
+    "Prediction": "prediction.result",
+    "Scenario": "scenario.scenario",
     "ScenarioError": "errors",
-    "Sensitivity": "inverse.sensitivity",
+    "Sensitivity": "questions.sensitivity",
     "StochfuseError": "errors",
     "UsageError": "errors",
-    "agents_needed": "inverse.agents_needed",
-    "check_results": "crosscheck",
-    "compare": "comparison",
-    "compare_estimators": "comparison",
-    "derive_general": "symbolic_general",
-    "derive_optimal": "symbolic_optimal",
-    "derive_simplified": "symbolic",
-    "least_link": "inverse.least_link",
-    "load_history": "fusion_graph",
-    "load_scenario": "scenario",
-    "message_load": "messages",
-    "predict": "methods",
-    "predict_states": "states",
-    "read_results": "results",
-    "sensitivity": "inverse.sensitivity",
-    "share_of_gain": "inverse.sensitivity",
-    "steady_state": "questions",
+    "agents_needed": "questions.agents_needed",
+    "check_results": "questions.crosscheck",
+    "compare": "prediction.compare",
+    "compare_estimators": "prediction.compare",
+    "derive_general": "symbolic.general",
+    "derive_optimal": "symbolic.optimal",
+    "derive_simplified": "symbolic.simplified",
+    "least_link": "questions.least_link",
+    "load_history": "estimators.fusion_graph",
+    "load_scenario": "scenario.scenario",
+    "message_load": "questions.messages",
+    "predict": "prediction.predict",
+    "predict_states": "prediction.states",
+    "read_results": "questions.results",
+    "sensitivity": "questions.sensitivity",
+    "share_of_gain": "questions.sensitivity",
+    "steady_state": "prediction.steady_state",
     "study": "studies.running",
 }
 

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import stochfuse as sf
-from stochfuse.general import outcomes
-from stochfuse.metrics import metric
-from stochfuse.scenario import link_rows
+from stochfuse.kalman.metrics import metric
+from stochfuse.prediction.general import outcomes
+from stochfuse.scenario.scenario import link_rows
 from tests import strategies, test_agreement, textbook
 
 LONG = ("ad hoc", "ad hoc, delays", "ad hoc, masked")

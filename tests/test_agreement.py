@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import stochfuse as sf
-from stochfuse.general import outcomes
-from stochfuse.scenario import link_rows
+from stochfuse.prediction.general import outcomes
+from stochfuse.scenario.scenario import link_rows
 from tests import strategies, textbook
 
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stochfuse.arrivals import SUM_UP_TO, Binomial, Counts, like_senders, poisson_binomial
+from stochfuse.kalman.arrivals import SUM_UP_TO, Binomial, Counts, like_senders, poisson_binomial
 from tests.strategies import probabilities, seeds
 
 NOISES = (0.0, 1e-14, 1e-8, 1e-3, 0.3, 1.0, 10.0, 1e4, 1e9, 1e14)

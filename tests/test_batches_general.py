@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 import stochfuse as sf
 from stochfuse.batches import claims, general, optimum
 from stochfuse.errors import NotABatchError
-from stochfuse.model import Noises
-from stochfuse.quantities import matrix
+from stochfuse.prediction.quantities import matrix
+from stochfuse.scenario.model import Noises
 from tests import strategies
 
 QUANTITIES = ("claimed", "actual", "bias", "rms")

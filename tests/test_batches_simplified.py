@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import stochfuse as sf
-from stochfuse.averaged import sound
 from stochfuse.batches.simplified import covariances
-from stochfuse.checks import covariance_fault
 from stochfuse.engines.mean_field import BLOCK
-from stochfuse.model import Noises
-from stochfuse.simplified import faults
+from stochfuse.kalman.averaged_update import sound
+from stochfuse.kalman.checks import covariance_fault
+from stochfuse.prediction.simplified import faults
+from stochfuse.scenario.model import Noises
 from tests import textbook
 from tests.strategies import covariance, mapping, model, seeds
 

@@ -423,7 +423,7 @@ def test_no_command_imports_what_it_does_not_need():
     for arguments in (["--help"], ["--version"]):
         assert not imported(*arguments) & {"numpy", "scipy", "sympy", "matplotlib", "pydantic"}
     # some versions of Typer import pydantic themselves; ours is the schema's
-    assert not imported("predict") & {"scipy", "sympy", "matplotlib", "stochfuse.tables.schema"}
+    assert not imported("predict") & {"scipy", "sympy", "matplotlib", "stochfuse.scenario.schema"}
     assert "scipy" not in imported("derive")
 
 

@@ -11,8 +11,8 @@ import pytest
 import stochfuse as sf
 from stochfuse.cli.options import Criterion, Estimator
 from stochfuse.errors import UsageError
-from stochfuse.names import CRITERIA, ESTIMATORS
-from stochfuse.report.estimators import EstimatorView, draw
+from stochfuse.report.comparisons import EstimatorView, draw_estimators
+from stochfuse.scenario.registry import CRITERIA, ESTIMATORS
 from tests.test_cli import run, strict_json
 
 
@@ -105,9 +105,9 @@ def test_figure(against):
     found = sf.compare_estimators(
         sf.load_scenario(steps=2), [0.0, 0.5, 1.0] if against == "link" else [0.5], ["naive", "split-ci"]
     )
-    from stochfuse.metrics import metric
+    from stochfuse.kalman.metrics import metric
 
-    figure = draw(EstimatorView(found, metric("trace", found.predictions[0].scenario.model)))
+    figure = draw_estimators(EstimatorView(found, metric("trace", found.predictions[0].scenario.model)))
     values, ratio = figure.axes
     assert values.get_xlabel() == ratio.get_xlabel() == ("link probability µ" if against == "link" else "step k")
     assert ratio.get_ylabel() == "actual / claimed"
@@ -155,9 +155,9 @@ def test_a_scenario_that_names_an_estimator_is_predicted_by_it(tmp_path):
 
 def test_no_two_curves_look_alike():
     found = sf.compare_estimators(sf.load_scenario(steps=1), [0.0, 1.0])
-    from stochfuse.metrics import metric
+    from stochfuse.kalman.metrics import metric
 
-    figure = draw(EstimatorView(found, metric("trace", found.predictions[0].scenario.model)))
+    figure = draw_estimators(EstimatorView(found, metric("trace", found.predictions[0].scenario.model)))
     looks = [(line.get_color(), line.get_marker()) for line in figure.axes[1].lines[:-1]]
     assert len(set(looks)) == len(looks) == len(ESTIMATORS)
 

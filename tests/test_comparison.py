@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import stochfuse as sf
-from stochfuse.comparison import compare
-from stochfuse.metrics import metric
+from stochfuse.kalman.metrics import metric
+from stochfuse.prediction.compare import compare
 from stochfuse.report import comparisons
 from stochfuse.report.predictions import View
 

@@ -10,8 +10,8 @@ import pytest
 
 import stochfuse as sf
 from stochfuse.engines import contact_chain, enclosure
-from stochfuse.engines.contacts import number_of_paths
-from stochfuse.network import Network
+from stochfuse.engines.contact_chain import number_of_paths
+from stochfuse.scenario.network import Network
 from tests import strategies, textbook
 from tests.test_accuracy import CASES
 

@@ -15,7 +15,6 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 import stochfuse
-from stochfuse.checks import Checker
 from stochfuse.errors import UsageError
 from stochfuse.fusion.cooperative import (
     KINDS,
@@ -28,13 +27,14 @@ from stochfuse.fusion.cooperative import (
     relation,
     residual,
 )
-from stochfuse.kalman import Estimate, update
-from stochfuse.tables.cooperative import read_cooperative
-from stochfuse.tables.cooperative_schema import CooperativeTable
+from stochfuse.kalman.kernel import Estimate, update
+from stochfuse.scenario.checker import Checker
+from stochfuse.scenario.cooperative import read_cooperative
+from stochfuse.scenario.schema import CooperativeTable
 from tests.strategies import covariance, seeds
 
 SIGMAS = {"range": (0.5, None), "direction": (None, 0.02), "both": (0.5, 0.02), "difference": (0.5, 0.02)}
-PRESETS = Path(stochfuse.__file__).parent / "presets"
+PRESETS = Path(stochfuse.__file__).parent / "scenario" / "presets"
 
 
 def two_places(rng, D, *batch, size=10.0):

@@ -11,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq, minimize, minimize_scalar
 
-from stochfuse import kalman
 from stochfuse.errors import NoAnswerError, UsageError
-from stochfuse.fusion.covariance_intersection import (
+from stochfuse.fusion.intersection import (
     Criterion,
     Signal,
     covariance_intersection,
@@ -21,6 +20,7 @@ from stochfuse.fusion.covariance_intersection import (
     pair_weights,
     split_covariance_intersection,
 )
+from stochfuse.kalman import kernel as kalman
 
 SMOOTH = [
     Criterion("det"),

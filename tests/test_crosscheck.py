@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import stochfuse as sf
-from stochfuse.crosscheck import check_results
-from stochfuse.metrics import metric
-from stochfuse.results import Results, ResultsError, read_results
+from stochfuse.kalman.metrics import metric
+from stochfuse.questions.crosscheck import check_results
+from stochfuse.questions.results import Results, ResultsError, read_results
 
 LINKS = ["0", "0.25", "0.5", "0.75", "1"]
 STEPS = 3

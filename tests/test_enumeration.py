@@ -9,10 +9,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import stochfuse as sf
-from stochfuse.engines import Progress
-from stochfuse.general import outcomes
-from stochfuse.metrics import metric
-from stochfuse.scenario import link_rows
+from stochfuse.engines.progress import Progress
+from stochfuse.kalman.metrics import metric
+from stochfuse.prediction.general import outcomes
+from stochfuse.scenario.scenario import link_rows
 from tests import strategies, textbook
 from tests.benchmarks import literal
 
@@ -143,7 +143,7 @@ def test_statistics_are_certain_where_nothing_is_left_to_chance():
 def test_statistics_in_blocks_of_rows(monkeypatch):
     p = sf.predict(sf.load_scenario(steps=3), np.linspace(0, 1, 7), method="general")
     whole = p.statistic("quantile:0.7"), p.statistic("variance")
-    monkeypatch.setattr("stochfuse.general.MOST_PROBABILITIES", 2000)
+    monkeypatch.setattr("stochfuse.prediction.general.MOST_PROBABILITIES", 2000)
     np.testing.assert_array_equal(p.statistic("quantile:0.7"), whole[0])
     np.testing.assert_allclose(p.statistic("variance"), whole[1], rtol=1e-13)
 

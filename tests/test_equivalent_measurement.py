@@ -17,7 +17,7 @@ from stochfuse.fusion.equivalent_measurement import (
     worst_error,
 )
 from stochfuse.fusion.extended import extended_filter, extended_step, jacobian
-from stochfuse.kalman import Estimate
+from stochfuse.kalman.kernel import Estimate
 from tests import textbook
 from tests.strategies import covariance, seeds
 

@@ -15,7 +15,6 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 import stochfuse
-from stochfuse.checks import Checker
 from stochfuse.errors import UsageError
 from stochfuse.fusion.inertial import (
     STATES,
@@ -30,13 +29,14 @@ from stochfuse.fusion.inertial import (
     noise_density,
 )
 from stochfuse.fusion.trajectory import Leg, Trajectory, trajectory
-from stochfuse.kalman import Estimate, predict, update
-from stochfuse.tables.navigation import read_navigation
-from stochfuse.tables.navigation_schema import NavigationTable
+from stochfuse.kalman.kernel import Estimate, predict, update
+from stochfuse.scenario.checker import Checker
+from stochfuse.scenario.navigation import read_navigation
+from stochfuse.scenario.schema import NavigationTable
 from tests.strategies import seeds
 
 OMEGA, A, E2 = 7.292115e-5, 6378137.0, 6.69437999014e-3
-PRESET = next((Path(stochfuse.__file__).parent / "presets").glob("gps-ins.toml*"))
+PRESET = next((Path(stochfuse.__file__).parent / "scenario" / "presets").glob("gps-ins.toml*"))
 LEGS = [Leg(5, 1.0), Leg(10, 0, np.deg2rad(4)), Leg(10, -0.5, np.deg2rad(-3), 6), Leg(10, 1.0, 0.0, -2)]
 NO_BIAS_DECAY = ImuGrade(0, 0, 0, 0, np.inf, 0, 0, np.inf)
 SMALL = InitialErrors(np.full(3, 1e-3), np.full(3, 0.1), np.full(3, 3.0))

@@ -18,11 +18,10 @@ from typer.testing import CliRunner
 
 import stochfuse as sf
 from stochfuse.cli.app import app
-from stochfuse.inverse.agents_needed import agents_needed
-from stochfuse.inverse.crossings import intervals, scanned, separated
-from stochfuse.inverse.least_link import least_link
-from stochfuse.inverse.question import question
-from stochfuse.inverse.sensitivity import sensitivity, share_of_gain
+from stochfuse.questions.agents_needed import agents_needed
+from stochfuse.questions.least_link import intervals, least_link, scanned, separated
+from stochfuse.questions.question import question
+from stochfuse.questions.sensitivity import sensitivity, share_of_gain
 from stochfuse.report.solutions import sensitivity_sheet
 from tests import textbook
 from tests.strategies import mapping, model

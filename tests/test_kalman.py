@@ -9,8 +9,8 @@ import sympy
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stochfuse.algebra import FIELD, SYMPY
-from stochfuse.kalman import (
+from stochfuse.kalman.algebra import FIELD, SYMPY
+from stochfuse.kalman.kernel import (
     Estimate,
     Information,
     factor,

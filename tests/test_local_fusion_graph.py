@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import stochfuse as sf
-from stochfuse.fusion_graph import FusionGraph, History, Message, load_history
+from stochfuse.estimators.fusion_graph import FusionGraph, History, Message, load_history
 from stochfuse.report import fusion_graph as report
 from tests import strategies, textbook
 

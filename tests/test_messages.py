@@ -18,18 +18,12 @@ from typer.testing import CliRunner
 
 import stochfuse as sf
 from stochfuse.cli.app import app
-from stochfuse.messages import (
-    accuracy,
-    in_bytes,
-    like_agents,
-    message_load,
-    node_bytes,
-)
-from stochfuse.metrics import metric
-from stochfuse.network import uniform_rows
+from stochfuse.kalman.metrics import metric
+from stochfuse.questions.messages import accuracy, in_bytes, like_agents, message_load, node_bytes
 from stochfuse.report import messages as reports
-from stochfuse.reproduction.message_table import TABLE_3, table_3
-from stochfuse.scenario import link_rows
+from stochfuse.scenario.network import uniform_rows
+from stochfuse.scenario.scenario import link_rows
+from stochfuse.thesis.bench import TABLE_3, table_3_rows
 from tests.strategies import probabilities
 from tests.textbook import histories
 
@@ -291,7 +285,7 @@ def test_sampled_loads():
 
 def test_table_3():
     """The published values within what the module says of them."""
-    rows = table_3()
+    rows = table_3_rows()
     assert len(rows) == 15
     for row in rows:
         broadcast = "broadcast" if row.column == "ad-hoc" else row.column

@@ -19,10 +19,10 @@ from typer.testing import CliRunner
 
 import stochfuse as sf
 from stochfuse.cli.app import app
-from stochfuse.scenario import parse, preset_names, read_text
+from stochfuse.scenario.scenario import parse, preset_names, read_text
 from stochfuse.studies.evaluation import evaluate
+from stochfuse.studies.files import Columns
 from stochfuse.studies.reading import load_study
-from stochfuse.studies.writing import Columns
 
 EXAMPLES = 500
 """Per test; two tests each for scenarios and studies."""

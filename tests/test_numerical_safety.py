@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 import stochfuse as sf
 from stochfuse.batches import predict as predict_batch
 from stochfuse.batches.simplified import covariances
-from stochfuse.checks import covariance_fault
-from stochfuse.engines.rounding import PROMISED, lost
-from stochfuse.fusion.covariance_intersection import pair_weights
-from stochfuse.kalman import (
+from stochfuse.engines.precision import PROMISED, lost
+from stochfuse.fusion.intersection import pair_weights
+from stochfuse.kalman.checks import covariance_fault
+from stochfuse.kalman.kernel import (
     Estimate,
     Information,
     factor,
@@ -29,9 +29,9 @@ from stochfuse.kalman import (
     update_factor,
     update_information,
 )
-from stochfuse.model import Noises
-from stochfuse.network import uniform_rows
-from stochfuse.simplified import reach_of_rounding
+from stochfuse.prediction.simplified import reach_of_rounding
+from stochfuse.scenario.model import Noises
+from stochfuse.scenario.network import uniform_rows
 from tests import textbook
 from tests.strategies import covariance, mapping, seeds
 from tests.test_accuracy import CASES, ODD_H, P0, F, H, Q

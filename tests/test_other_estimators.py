@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import stochfuse as sf
-from stochfuse.general import outcomes
-from stochfuse.rules import PASTS
-from stochfuse.scenario import link_rows
+from stochfuse.estimators.making import PASTS
+from stochfuse.prediction.general import outcomes
+from stochfuse.scenario.scenario import link_rows
 from tests import strategies, test_agreement, textbook, textbook_estimators
 
 ONE_STATE = tuple(textbook_estimators.RULES)

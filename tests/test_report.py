@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import stochfuse as sf
-from stochfuse.metrics import metric
+from stochfuse.kalman.metrics import metric
 from stochfuse.report.predictions import View, predict_table
 from stochfuse.report.table import Table, to_latex, to_markdown, to_text
 

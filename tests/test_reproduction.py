@@ -15,12 +15,12 @@ from stochfuse.cli import reproduce as command
 from stochfuse.cli.app import app
 from stochfuse.errors import UsageError
 from stochfuse.report import reproductions as report
-from stochfuse.reproduction import Bench, about_covariance, about_errors, about_records, catalogue, find, records, sheet
-from stochfuse.reproduction.bench import ARCHITECTURES, LFG, LINKS, NAIVE, SIMPLIFIED, STEADY, TRANSIENT, Case
-from stochfuse.reproduction.catalogue import NOT_COVERED
-from stochfuse.reproduction.figures import time_average
-from stochfuse.reproduction.pages import statements
-from stochfuse.reproduction.statements import explained, judged
+from stochfuse.thesis import Bench, about_covariance, about_errors, about_records, catalogue, find, sheet
+from stochfuse.thesis import bench as records
+from stochfuse.thesis.bench import ARCHITECTURES, LFG, LINKS, NAIVE, SIMPLIFIED, STEADY, TRANSIENT, Case
+from stochfuse.thesis.catalogue import NOT_COVERED, statements
+from stochfuse.thesis.figures import time_average
+from stochfuse.thesis.statements import explained, judged
 from tests import textbook
 from tests.test_cli import run, strict_json
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import stochfuse as sf
-from stochfuse.scenario import parse, preset_names, read_text
-from stochfuse.tables.schema import structure_problems
+from stochfuse.scenario.scenario import parse, preset_names, read_text
+from stochfuse.scenario.schema import structure_problems
 
 GOOD = {
     "schema": "stochfuse.scenario/1",

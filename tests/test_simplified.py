@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import stochfuse as sf
-from stochfuse.kalman import Estimate
-from stochfuse.simplified import outcome, outcome_as_printed, outcome_by_information
+from stochfuse.kalman.kernel import Estimate
+from stochfuse.prediction.simplified import outcome, outcome_as_printed, outcome_by_information
 from tests import textbook
 from tests.strategies import covariance, mapping, model, probabilities, seeds
 

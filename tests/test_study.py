@@ -14,9 +14,9 @@ import pytest
 import stochfuse as sf
 from stochfuse import batches
 from stochfuse.studies import evaluation
+from stochfuse.studies.files import packed, unpacked
 from stochfuse.studies.plan import put
 from stochfuse.studies.reading import load_study, plan_of
-from stochfuse.studies.writing import packed, unpacked
 
 THREE = {"network.link": [0.0, 0.3, 1.0], "model.R": [1.0, 100.0], "network.agents": [2, 3]}
 
@@ -355,7 +355,7 @@ def test_csv_and_parquet_hold_the_same(tmp_path):
 
 @pytest.mark.parametrize("name", ["r.csv", "r.parquet"])
 def test_results_are_read_in_blocks(tmp_path, name, monkeypatch):
-    monkeypatch.setattr("stochfuse.studies.results.LINES", 7)
+    monkeypatch.setattr("stochfuse.studies.files.LINES", 7)
     monkeypatch.setattr("stochfuse.studies.plan.CHUNK", {"simplified": 5})
     vary = {"network.steps": [1, 4], "network.link": [0.1, 0.2, 0.3], "model.R": [1.0, -1.0]}
     results = sf.study(asked(vary, report={"quantity": ["claimed", "messages"]}), tmp_path / name)

@@ -19,15 +19,12 @@ from hypothesis import strategies as st
 
 from stochfuse.errors import NoAnswerError, UsageError
 from stochfuse.report import studies
-from stochfuse.report.front_plots import draw_pareto
-from stochfuse.report.study_axes import levels_of
-from stochfuse.report.study_maps import edges
-from stochfuse.report.study_plots import draw, plot_over, plot_pareto
+from stochfuse.report.studies import shortened, spoken
+from stochfuse.report.study_figures import draw, draw_pareto, edges, levels_of, plot_over, plot_pareto
 from stochfuse.report.study_slices import thinned
-from stochfuse.report.study_words import shortened, spoken
 from stochfuse.report.table import to_text
-from stochfuse.studies.axes import Axis
 from stochfuse.studies.pareto import Front, front, pareto, rounded
+from stochfuse.studies.plan import Axis
 
 LABELS = {
     "claimed.trace": "claimed trace [m²]",

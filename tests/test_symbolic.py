@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from sympy.polys.fields import field
 
 import stochfuse as sf
-from stochfuse.algebra import FIELD, SYMPY, inverse
-from stochfuse.kalman import Estimate, predict, to_information, update
-from stochfuse.simplified import average, outcome, outcome_as_printed, outcome_by_information
-from stochfuse.symbolic import MU, P0, Q, R, derive_simplified
+from stochfuse.kalman.algebra import FIELD, SYMPY, inverse
+from stochfuse.kalman.kernel import Estimate, predict, to_information, update
+from stochfuse.prediction.simplified import average, outcome, outcome_as_printed, outcome_by_information
+from stochfuse.symbolic.simplified import MU, P0, Q, R, derive_simplified
 from tests import textbook
 from tests.strategies import mapping, same
 

@@ -10,8 +10,8 @@ import sympy
 
 import stochfuse as sf
 from stochfuse.report import derivation
-from stochfuse.symbolic import MU, P0, Q, R
-from stochfuse.symbolic_general import derive_general
+from stochfuse.symbolic.general import derive_general
+from stochfuse.symbolic.simplified import MU, P0, Q, R
 from tests import textbook
 
 

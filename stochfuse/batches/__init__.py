@@ -11,15 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.batches import general, optimum, simplified
-from stochfuse.checks import covariance_fault, first_fault
-from stochfuse.conditioning import told
-from stochfuse.engines.rounding import PROMISED
+from stochfuse.engines.precision import PROMISED, told
 from stochfuse.errors import NotABatchError
-from stochfuse.methods import LFG, MOST_GRAPHS, group_of
-from stochfuse.model import Noises
-from stochfuse.prediction import Prediction
-from stochfuse.quantities import Moments
-from stochfuse.scenario import Scenario
+from stochfuse.kalman.checks import covariance_fault, first_fault
+from stochfuse.kalman.metrics import Moments
+from stochfuse.prediction.predict import LFG, MOST_GRAPHS, group_of
+from stochfuse.prediction.result import Prediction
+from stochfuse.scenario.model import Noises
+from stochfuse.scenario.scenario import Scenario
 
 WORTHLESS = 1e-3
 """Relative rounding beyond which it is no answer."""
@@ -63,7 +62,7 @@ def predict(
     scenario : what they have in common.
     link : (items,) link probability of each, the same for all links and steps.
     noises : theirs, checked to be covariances.
-    method, quantities, **settings : as for `stochfuse.methods.predict_several`.
+    method, quantities, **settings : as for `stochfuse.prediction.predict.predict_several`.
 
     Returns
     -------

@@ -21,14 +21,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.engines import uncollected
 from stochfuse.engines.enumeration import Ending, View
-from stochfuse.general import Enumerated, enumerated
-from stochfuse.information import Ledger
-from stochfuse.model import Noises
-from stochfuse.network import LinkRows, Network, restricted, uniform_rows
-from stochfuse.scenario import Scenario
-from stochfuse.sources import batched
+from stochfuse.engines.progress import uncollected
+from stochfuse.estimators.ledger import Ledger
+from stochfuse.estimators.world import batched
+from stochfuse.prediction.general import Enumerated, enumerated
+from stochfuse.scenario.model import Noises
+from stochfuse.scenario.network import LinkRows, Network, restricted, uniform_rows
+from stochfuse.scenario.scenario import Scenario
 
 MOST_KEPT = 8
 """Structures kept for the batches to come."""
@@ -91,7 +91,9 @@ class Claims(NamedTuple):
 
 @lru_cache(maxsize=MOST_KEPT)
 def claims_of(key: Key, estimator: str, errors: bool, max_graphs: int) -> Claims:
-    """Return the claims of a scenario's outcomes; parameters and errors are those of `stochfuse.general.outcomes`."""
+    """Return the claims of a scenario's outcomes; parameters and errors are those of
+    `stochfuse.prediction.general.outcomes`.
+    """
     # the first covariance is not used, and may be one that has no inverse
     plain = batched(key.scenario, Noises(P0=np.eye(key.scenario.model.dimension)))
     rows = typical_rows(key.scenario.network)

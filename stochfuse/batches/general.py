@@ -14,17 +14,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.batches.claims import Claims, Key, Step, claims_of
-from stochfuse.conditioning import NO_DIGIT, MovedSources, change, reach, suspects
+from stochfuse.engines.events import monomials
+from stochfuse.engines.precision import NO_DIGIT, MovedSources, change, reach, suspects
 from stochfuse.errors import NoAnswerError, NotABatchError, StochfuseError
-from stochfuse.information import Sources, estimated, evaluate_atoms, unpacked
-from stochfuse.kalman import Estimate
-from stochfuse.model import Noises
-from stochfuse.quantities import Moments
-from stochfuse.rules import SUMS, make
-from stochfuse.scenario import Scenario
-from stochfuse.sources import batched, claimed_only, error_sources, sources_of
-from stochfuse.sources import moments as of_footprints
-from stochfuse.weights import monomials
+from stochfuse.estimators.ledger import Sources, estimated, evaluate_atoms, unpacked
+from stochfuse.estimators.making import SUMS, make
+from stochfuse.estimators.world import batched, claimed_only, error_sources, sources_of
+from stochfuse.estimators.world import moments as of_footprints
+from stochfuse.kalman.kernel import Estimate
+from stochfuse.kalman.metrics import Moments
+from stochfuse.scenario.model import Noises
+from stochfuse.scenario.scenario import Scenario
 
 BLOCK = 1 << 20
 """Numbers that the atoms of a block of items take."""
@@ -77,8 +77,8 @@ def moments(
         If they cannot be evaluated together: another estimator, links that differ or are bursty, unlike sensors with
         noises R of their own, a number that is not finite.
     UsageError, NoAnswerError
-        As `stochfuse.general.outcomes`, if that would raise it for one item; a NoAnswerError names such items, if not
-        all of them.
+        As `stochfuse.prediction.general.outcomes`, if that would raise it for one item; a NoAnswerError names such
+        items, if not all of them.
     """
     check_batch(scenario, link, noises)
     if estimator not in SUMS:

@@ -14,16 +14,25 @@ import numpy as np
 
 from stochfuse.batches.claims import Key, typical_rows
 from stochfuse.batches.general import check_batch, with_starts
-from stochfuse.conditioning import suspects
-from stochfuse.engines.contact_chain import Filter, TooManyPathsError, by_counts, check_size, joined, over_paths
-from stochfuse.engines.contacts import Contacts, contacts, number_of_paths
+from stochfuse.engines.contact_chain import (
+    Contacts,
+    Filter,
+    TooManyPathsError,
+    by_counts,
+    check_size,
+    contacts,
+    joined,
+    number_of_paths,
+    over_paths,
+)
+from stochfuse.engines.precision import suspects
 from stochfuse.errors import NotABatchError
-from stochfuse.model import Model, Noises, Sensor
-from stochfuse.network import restricted, uniform_rows
-from stochfuse.optimum import counted, filter_of, groups_of, rounding
-from stochfuse.quantities import Moments
-from stochfuse.scenario import Scenario
-from stochfuse.sources import batched
+from stochfuse.estimators.world import batched
+from stochfuse.kalman.metrics import Moments
+from stochfuse.prediction.optimal import counted, filter_of, groups_of, rounding
+from stochfuse.scenario.model import Model, Noises, Sensor
+from stochfuse.scenario.network import restricted, uniform_rows
+from stochfuse.scenario.scenario import Scenario
 
 BLOCK = 1 << 19
 """Numbers that covariances, weights or transitions of a block of items take."""
@@ -64,7 +73,7 @@ def moments(scenario: Scenario, link: np.ndarray, noises: Noises, *, errors: boo
         If they cannot be evaluated together: links that differ or are bursty, unlike sensors with noises R of their
         own, more paths than can be gone through one by one, a number that is not finite.
     UsageError
-        As `stochfuse.optimum.optimum`, if that would raise it for one item.
+        As `stochfuse.prediction.optimal.optimum`, if that would raise it for one item.
     """
     check_batch(scenario, link, noises)
     network = scenario.network

@@ -11,15 +11,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stochfuse import simplified
-from stochfuse.averaged import noise_factor
-from stochfuse.conditioning import told
 from stochfuse.engines.mean_field import BLOCK, Case, run_like
-from stochfuse.engines.rounding import definite, lost, rounding
+from stochfuse.engines.precision import definite, lost, rounding, told
 from stochfuse.errors import UsageError
-from stochfuse.model import Noises
-from stochfuse.network import default_rows, require_memoryless, uniform_rows
-from stochfuse.scenario import Scenario, require_independent_noise, require_one_state
+from stochfuse.kalman.averaged_update import noise_factor
+from stochfuse.prediction import simplified
+from stochfuse.scenario.model import Noises
+from stochfuse.scenario.network import default_rows, require_memoryless, uniform_rows
+from stochfuse.scenario.scenario import Scenario, require_independent_noise, require_one_state
 
 DOUBTFUL = 1e-10
 """Smallest pivot of R, relative to its variance, below which it takes a library's word that there is a factor."""
@@ -34,7 +33,7 @@ class Covariances(NamedTuple):
     P : (items, steps, d, d), in the units of the model; an item with a fault may have entries that are not finite.
     forms : which numeric forms were used.
     faults : per item whose result is no covariance, the first step and why; and of one that is, but of which rounding
-        leaves less than nine digits (see `stochfuse.engines.rounding`), by how much.
+        leaves less than nine digits (see `stochfuse.engines.precision`), by how much.
     """
 
     P: np.ndarray

@@ -40,8 +40,8 @@ from stochfuse.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from stochfuse.metrics import Metric
-    from stochfuse.scenario import Scenario
+    from stochfuse.kalman.metrics import Metric
+    from stochfuse.scenario.scenario import Scenario
 
 
 def compare(
@@ -105,8 +105,8 @@ def compare(
     shared information twice), monte-carlo is sampled, with its standard error.
     """
     from stochfuse.errors import UsageError
-    from stochfuse.metrics import metric as metric_of
-    from stochfuse.names import INTERSECTIONS
+    from stochfuse.kalman.metrics import metric as metric_of
+    from stochfuse.scenario.registry import INTERSECTIONS
 
     check_files(output, plot, scenario)
     given, links = load(scenario, agents, steps, architecture, q, r, p0, link)
@@ -151,7 +151,7 @@ def _names(text: str) -> list[str]:
 
 
 def _known(estimator: str) -> str:
-    from stochfuse.methods import ESTIMATORS, choose
+    from stochfuse.prediction.predict import ESTIMATORS, choose
 
     choose("estimator", estimator, ESTIMATORS)
     return estimator
@@ -179,7 +179,7 @@ def _methods(
     settings: dict[str, Any],
 ) -> None:
     from stochfuse.cli.progress import shown
-    from stochfuse.comparison import compare as run
+    from stochfuse.prediction.compare import compare as run
     from stochfuse.report import comparisons
     from stochfuse.report.predictions import View
 
@@ -214,9 +214,9 @@ def _estimators(
     settings: dict[str, Any],
 ) -> None:
     from stochfuse.cli.progress import shown
-    from stochfuse.comparison import compare_estimators as run
-    from stochfuse.quantities import check
-    from stochfuse.report import estimators
+    from stochfuse.prediction.compare import compare_estimators as run
+    from stochfuse.prediction.quantities import check
+    from stochfuse.report import comparisons as estimators
 
     for name in quantities:
         check(name, how.metric)

@@ -29,9 +29,9 @@ from stochfuse.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from stochfuse.network import LinkRows
-    from stochfuse.results import Results
-    from stochfuse.scenario import Scenario
+    from stochfuse.questions.results import Results
+    from stochfuse.scenario.network import LinkRows
+    from stochfuse.scenario.scenario import Scenario
 
 
 class Against(StrEnum):
@@ -76,12 +76,12 @@ def crosscheck(
     The column covariance holds the claimed covariance after fusion, as the metric says (default: trace). Per cell a
     z-score; the verdict corrects for the number of cells.
     """
-    from stochfuse.crosscheck import check_results
     from stochfuse.errors import UsageError
-    from stochfuse.metrics import metric as metric_of
+    from stochfuse.kalman.metrics import metric as metric_of
+    from stochfuse.questions.crosscheck import check_results
+    from stochfuse.questions.results import read_results
     from stochfuse.report import crosschecks
     from stochfuse.report.predictions import View
-    from stochfuse.results import read_results
 
     check_files(output, None, file, scenario)
     settings = settings_for([method.value], max_graphs=max_graphs, prune=prune)
@@ -127,9 +127,9 @@ def crosscheck(
 
 def _rows(results: Results, scenario: Scenario) -> LinkRows:
     """Rows of the prediction for the file's link probabilities or names of cases."""
-    from stochfuse.network import stacked_rows
-    from stochfuse.results import ResultsError
-    from stochfuse.scenario import link_rows
+    from stochfuse.questions.results import ResultsError
+    from stochfuse.scenario.network import stacked_rows
+    from stochfuse.scenario.scenario import link_rows
 
     links, cases = results.links, dict(scenario.network.cases)
     if links == [""]:
@@ -159,7 +159,7 @@ def _rows(results: Results, scenario: Scenario) -> LinkRows:
 
 def _predict(scenario: Scenario, rows: LinkRows, method: Against, settings: dict[str, Any]):
     from stochfuse.cli.progress import shown
-    from stochfuse.methods import predict
+    from stochfuse.prediction.predict import predict
 
     with shown() as progress:
         return predict(scenario, rows, method.value, progress=progress, **settings)

@@ -65,24 +65,24 @@ def derive(
     import sys
 
     from stochfuse.errors import UsageError
-    from stochfuse.report.export import check_writable, terminal_width, to_json, write_text
+    from stochfuse.report.table import check_writable, terminal_width, to_json, write_text
 
     if latex and format not in (None, FormulaFormat.latex):
         raise UsageError("--latex and --format: expected one of them, got both")
     check_writable(output)
     from stochfuse.report import derivation
-    from stochfuse.symbolic import SimplifiedForm, derive_simplified
+    from stochfuse.symbolic.simplified import SimplifiedForm, derive_simplified
 
     if formulation is Formulation.simplified:
         if architecture is Architecture.cyclic:
             raise UsageError("--architecture cyclic: expected formulation general, got simplified")
         form = derive_simplified(agents, step, q, r, p0, correlation=correlation.value)
     elif formulation is Formulation.optimal:
-        from stochfuse.symbolic_optimal import derive_optimal
+        from stochfuse.symbolic.optimal import derive_optimal
 
         form = derive_optimal(agents, step, q, r, p0, architecture=architecture.value, correlation=correlation.value)
     else:
-        from stochfuse.symbolic_general import derive_general
+        from stochfuse.symbolic.general import derive_general
 
         estimator = "naive" if formulation is Formulation.naive else "local-fusion-graph"
         start = correlation.value

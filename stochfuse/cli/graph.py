@@ -43,10 +43,10 @@ def graph(
     Without a history: the worked example of the thesis' section 2.4.
     """
     from stochfuse.errors import UsageError
-    from stochfuse.fusion_graph import FusionGraph, load_history
-    from stochfuse.metrics import metric as metric_of
+    from stochfuse.estimators.fusion_graph import FusionGraph, load_history
+    from stochfuse.kalman.metrics import metric as metric_of
     from stochfuse.report import fusion_graph as report
-    from stochfuse.report.export import terminal_width, to_json, write_text
+    from stochfuse.report.table import terminal_width, to_json, write_text
 
     check_files(output, plot, history, scenario or "")
     made = FusionGraph(load_history(history), shared=shared)
@@ -57,7 +57,7 @@ def graph(
         raise UsageError("a drawing shows one agent at one step: expected --agent and --step")
     values = None
     if scenario is not None:
-        from stochfuse.scenario import load_scenario
+        from stochfuse.scenario.scenario import load_scenario
 
         n, steps = made.history.agents, made.history.steps
         given = load_scenario(scenario, agents=n, steps=steps, uniform_link=True)

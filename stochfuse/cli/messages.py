@@ -33,7 +33,7 @@ from stochfuse.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from stochfuse.messages import MessageLoad
+    from stochfuse.questions.messages import MessageLoad
 
 
 class Rule(StrEnum):
@@ -103,9 +103,9 @@ def messages(
     Example: stochfuse messages --steps 12 --from-step 6 --architecture broadcast
     """
     from stochfuse.errors import UsageError
-    from stochfuse.messages import RULES, message_load
-    from stochfuse.messages import accuracy as accuracy_of
-    from stochfuse.metrics import metric as metric_of
+    from stochfuse.kalman.metrics import metric as metric_of
+    from stochfuse.questions.messages import RULES, message_load
+    from stochfuse.questions.messages import accuracy as accuracy_of
     from stochfuse.report import messages as reports
 
     check_files(output, plot, scenario)

@@ -11,7 +11,7 @@ import typer
 
 if TYPE_CHECKING:
     from stochfuse.report.table import Table
-    from stochfuse.scenario import Scenario
+    from stochfuse.scenario.scenario import Scenario
 
 MOST_LINKS = 1_000_000
 
@@ -61,7 +61,7 @@ class Architecture(StrEnum):
 
 def complete_scenario(incomplete: str) -> list[str]:
     """Return the presets that begin so, for the shell."""
-    from stochfuse.scenario import preset_names
+    from stochfuse.scenario.scenario import preset_names
 
     return [name for name in preset_names() if name.startswith(incomplete)]
 
@@ -183,7 +183,7 @@ def load(
     link: str | None,
 ) -> tuple[Scenario, list[float] | None]:
     """Return the scenario with the options' values in it, and the link probabilities asked for."""
-    from stochfuse.scenario import load_scenario
+    from stochfuse.scenario.scenario import load_scenario
 
     links = None if link is None else parse_link(link)
     given = load_scenario(
@@ -238,7 +238,7 @@ def quantity_names(text: str) -> list[str]:
         If one is unknown or named twice.
     """
     from stochfuse.errors import UsageError
-    from stochfuse.quantities import QUANTITIES
+    from stochfuse.prediction.quantities import QUANTITIES
 
     names = [name.strip() for name in text.split(",")]
     for name in names:
@@ -252,7 +252,7 @@ def quantity_names(text: str) -> list[str]:
 def check_files(output: Path | None, plot: Path | None, *inputs: str) -> None:
     """Raise UsageError early if a file can never be written, if two are one, or if one is an input."""
     from stochfuse.errors import UsageError
-    from stochfuse.report.export import PLOT_SUFFIXES, check_writable
+    from stochfuse.report.table import PLOT_SUFFIXES, check_writable
 
     check_writable(output)
     check_writable(plot, PLOT_SUFFIXES)
@@ -312,8 +312,7 @@ def write_report(
     json: Callable[[], Any],
 ) -> None:
     """Write a report to standard output or a file, in the format asked for; only that one is made."""
-    from stochfuse.report.export import terminal_width, to_json, write_text
-    from stochfuse.report.table import render
+    from stochfuse.report.table import render, terminal_width, to_json, write_text
 
     kind = chosen_format(format, output)
     if kind == Format.csv.value:
@@ -329,6 +328,6 @@ def chosen_format(format: Format | None, output: Path | None) -> str:
     """Return the format asked for, else the one that the output's name suggests, else table."""
     if format is not None:
         return format.value
-    from stochfuse.report.export import SUFFIXES
+    from stochfuse.report.table import SUFFIXES
 
     return SUFFIXES.get(output.suffix.lower(), "table") if output else "table"

@@ -103,9 +103,9 @@ def predict(
     Without a scenario: the thesis' transient one. Options override the scenario.
     """
     from stochfuse.errors import UsageError
-    from stochfuse.methods import predict_several as run
-    from stochfuse.metrics import metric as metric_of
-    from stochfuse.quantities import check
+    from stochfuse.kalman.metrics import metric as metric_of
+    from stochfuse.prediction.predict import predict_several as run
+    from stochfuse.prediction.quantities import check
     from stochfuse.report.predictions import View
 
     check_files(output, plot, scenario)
@@ -120,7 +120,7 @@ def predict(
             raise UsageError(f"--statistic {statistic}: expected --method general or naive, got {way.value}")
         if normalise:
             raise UsageError("--normalise: expected --statistic mean")
-        from stochfuse.general import check_statistic
+        from stochfuse.prediction.general import check_statistic
 
         for name in quantities:
             check_statistic(statistic, name, chosen)
@@ -157,7 +157,7 @@ def _report(view: View, format: Format | None, output: Path | None, plot: Path |
     from stochfuse.report import predictions
 
     if plot is not None:
-        from stochfuse.report.plot import plot_prediction
+        from stochfuse.report.predictions import plot_prediction
 
         plot_prediction(view, plot)
     write_report(
@@ -170,7 +170,7 @@ def _report(view: View, format: Format | None, output: Path | None, plot: Path |
 
 
 def _report_several(views: tuple[View, ...], format: Format | None, output: Path | None, plot: Path | None) -> None:
-    from stochfuse.report import side_by_side
+    from stochfuse.report import predictions as side_by_side
 
     if plot is not None:
         side_by_side.plot_side(views, plot)

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import typer
 
-from stochfuse.engines import Progress
+from stochfuse.engines.progress import Progress
 
 
 class Shown(Progress):

@@ -22,12 +22,12 @@ from stochfuse.cli.options import (
 
 if TYPE_CHECKING:
     from stochfuse.report.reproductions import Sheet
-    from stochfuse.reproduction import Bench
+    from stochfuse.thesis import Bench
 
 
 def complete_item(incomplete: str) -> list[str]:
     """Return the keys that begin so, for the shell."""
-    from stochfuse.reproduction import listing
+    from stochfuse.thesis import listing
 
     keys = [key for key, _ in listing()] + ["statements", "all", "timing"]
     return [key for key in keys if key.startswith(incomplete)]
@@ -63,7 +63,7 @@ def reproduce(
     """
     from stochfuse.cli.progress import shown
     from stochfuse.errors import UsageError
-    from stochfuse.reproduction import Bench, find, sheet
+    from stochfuse.thesis import Bench, find, sheet
 
     if plot is not None and what in (None, "statements", "all", "timing"):
         raise UsageError("--plot: expected the key of a figure, such as figure-32, to draw")
@@ -97,7 +97,7 @@ def reproduce(
 def _list(format: Format | None, output: Path | None) -> None:
     from stochfuse.report import reproductions as report
     from stochfuse.report.table import to_csv
-    from stochfuse.reproduction import listing
+    from stochfuse.thesis import listing
 
     entries = listing()
     write_report(
@@ -111,7 +111,7 @@ def _list(format: Format | None, output: Path | None) -> None:
 
 def _statements(bench: Bench, format: Format | None, output: Path | None) -> None:
     from stochfuse.report import reproductions as report
-    from stochfuse.reproduction import page
+    from stochfuse.thesis import page
 
     findings = page(bench)
     title = ("Statements of the thesis' chapters 3 and 4, in our words, and what our numbers say to them",)
@@ -126,7 +126,7 @@ def _statements(bench: Bench, format: Format | None, output: Path | None) -> Non
 
 def _timing(format: Format | None, output: Path | None, workers: int | None) -> None:
     from stochfuse.report import table
-    from stochfuse.reproduction import timing
+    from stochfuse.thesis import timing
 
     measured = timing(workers=workers)
     headings = ("work", "thesis_s", "here_s")
@@ -135,8 +135,7 @@ def _timing(format: Format | None, output: Path | None, workers: int | None) -> 
 
 def _write_sheet(found: Sheet, format: Format | None, output: Path | None, digits: int) -> None:
     from stochfuse.report import reproductions as report
-    from stochfuse.report.export import terminal_width, to_json, write_text
-    from stochfuse.report.table import render
+    from stochfuse.report.table import render, terminal_width, to_json, write_text
 
     kind = chosen_format(format, output)
     if kind == Format.csv.value:
@@ -151,9 +150,9 @@ def _write_sheet(found: Sheet, format: Format | None, output: Path | None, digit
 def _everything(bench: Bench, output: Path | None, format: Format | None) -> None:
     """Write data, statements and plot of every figure and table into a directory."""
     from stochfuse.errors import UsageError
-    from stochfuse.report.export import SUFFIXES
     from stochfuse.report.reproductions import plot_sheet
-    from stochfuse.reproduction import listing, sheet
+    from stochfuse.report.table import SUFFIXES
+    from stochfuse.thesis import listing, sheet
 
     if output is None or not output.is_dir():
         got = "nothing" if output is None else f"'{output}'"

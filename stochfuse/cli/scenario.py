@@ -26,8 +26,8 @@ NEW_HEADER = """\
 def list_presets(format: FormatOption = None, output: OutputOption = None) -> None:
     """List the presets."""
     from stochfuse.report import table
-    from stochfuse.report.export import terminal_width, to_json, write_text
-    from stochfuse.scenario import load_scenario, preset_names
+    from stochfuse.report.table import terminal_width, to_json, write_text
+    from stochfuse.scenario.scenario import load_scenario, preset_names
 
     keys = ("name", "agents", "steps", "states", "description")
     entries = []
@@ -52,8 +52,8 @@ def show(
     output: OutputOption = None,
 ) -> None:
     """Print a scenario, after checking it, in a form that can be saved and edited."""
-    from stochfuse.report.export import to_json, write_text
-    from stochfuse.scenario import Scenario, parse, read_text
+    from stochfuse.report.table import to_json, write_text
+    from stochfuse.scenario.scenario import Scenario, parse, read_text
 
     name, text = read_text(scenario)
     checked = Scenario.from_mapping(parse(name, text), name)
@@ -63,7 +63,7 @@ def show(
 @app.command()
 def check(scenario: ScenarioArgument) -> None:
     """Check a scenario: name every key that does not fit, exit 2, or say what it describes."""
-    from stochfuse.scenario import Scenario, parse, read_text
+    from stochfuse.scenario.scenario import Scenario, parse, read_text
 
     name, text = read_text(scenario)
     s = Scenario.from_mapping(parse(name, text), name)
@@ -81,9 +81,9 @@ def schema(
     output: OutputOption = None,
 ) -> None:
     """Print the JSON Schema of a scenario file."""
-    from stochfuse.report.export import to_json, write_text
-    from stochfuse.studies.schema import StudyFile
-    from stochfuse.tables.schema import ScenarioFile
+    from stochfuse.report.table import to_json, write_text
+    from stochfuse.scenario.schema import ScenarioFile
+    from stochfuse.studies.plan import StudyFile
 
     structure = StudyFile if study else ScenarioFile
     write_text(to_json(structure.model_json_schema(by_alias=True)), output)
@@ -98,8 +98,8 @@ def new(
 ) -> None:
     """Print a scenario file to begin with; --output saves it and never overwrites."""
     from stochfuse.errors import UsageError
-    from stochfuse.report.export import check_writable, write_text
-    from stochfuse.scenario import is_preset, preset_names, read_text
+    from stochfuse.report.table import check_writable, write_text
+    from stochfuse.scenario.scenario import is_preset, preset_names, read_text
 
     if not is_preset(preset):
         raise UsageError(f"no preset '{preset}'; the presets are {', '.join(preset_names())}")

@@ -35,7 +35,7 @@ from stochfuse.cli.predict import Method
 
 if TYPE_CHECKING:
     from stochfuse.report.solutions import Sheet
-    from stochfuse.scenario import Scenario
+    from stochfuse.scenario.scenario import Scenario
 
 
 def solve(
@@ -119,7 +119,7 @@ def solve(
         sheet, found = _answer(kind, given, links, target, case, max_agents, digits, asked)
     _note(sheet)
     if plot is not None:
-        from stochfuse.report.solution_plots import plot_solution
+        from stochfuse.report.solutions import plot_solution
 
         plot_solution(sheet, found, plot)
     write_report(
@@ -160,8 +160,8 @@ def _answer(
     digits: int,
     asked: dict[str, Any],
 ) -> tuple[Sheet, Any]:
-    from stochfuse.inverse import agents_needed, least_link, sensitivity
-    from stochfuse.inverse.question import question
+    from stochfuse.questions import agents_needed, least_link, sensitivity
+    from stochfuse.questions.question import question
     from stochfuse.report import solutions
 
     if kind == "target":

@@ -19,7 +19,7 @@ from stochfuse.cli.options import DigitsOption, Format, write_report
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from stochfuse.studies.results import Results
+    from stochfuse.studies.files import Results
 
 EVERY = 30.0
 """Seconds between lines of progress where there is no terminal for a bar."""
@@ -114,7 +114,7 @@ def study(
         _pareto(results, column, step, _pairs(where or []), plot, digits, format)
         return
     if plot is not None:
-        from stochfuse.report.study_plots import plot_over
+        from stochfuse.report.study_figures import plot_over
 
         keys = None if over is None else tuple(key.strip() for key in over.split(","))
         plot_over(results, keys, column, (kind or Kind.heat).value, _pairs(where or []), step, plot)
@@ -146,7 +146,7 @@ def _pareto(
     for note in front.notes:
         typer.echo(f"note: {note}", err=True)
     if plot is not None:
-        from stochfuse.report.study_plots import plot_pareto
+        from stochfuse.report.study_figures import plot_pareto
 
         plot_pareto(front, results, plot)
     write_report(

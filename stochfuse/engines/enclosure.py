@@ -25,6 +25,7 @@ import numpy as np
 from stochfuse.engines.contact_chain import (
     Carried,
     Chain,
+    Contacts,
     Filter,
     blocks_of_rows,
     by_counts,
@@ -33,8 +34,7 @@ from stochfuse.engines.contact_chain import (
     leading,
     transitions,
 )
-from stochfuse.engines.contacts import Contacts
-from stochfuse.kalman import factor, from_factor
+from stochfuse.kalman.kernel import factor, from_factor
 
 GRID = 800
 """Grid cells over the range of P."""

@@ -24,12 +24,11 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from stochfuse.engines import Progress, uncollected
+from stochfuse.engines.events import Event, Outcome, Rows, Weights, concerning, fates, outcomes
+from stochfuse.engines.progress import Progress, uncollected
 from stochfuse.errors import UsageError
-from stochfuse.estimators import AdditiveEstimator, Claims, Estimator
-from stochfuse.events import Event, Outcome, concerning, fates, outcomes
-from stochfuse.kalman import Estimate
-from stochfuse.weights import Rows, Weights
+from stochfuse.estimators.protocol import AdditiveEstimator, Claims, Estimator
+from stochfuse.kalman.kernel import Estimate
 
 MOST_GENERATORS = 6
 """Agents up to which truth tables of the lattice fit 64 bits."""

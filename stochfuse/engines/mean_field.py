@@ -2,7 +2,7 @@
 
 Applied to the broadcast prior this is the simplified stochastic formulation (53)/(54): in every step the prior is the
 prediction of the averaged covariance, the common information of any set of messages is approximated by m times that
-prior, and so m arrivals make one Kalman update with m + 1 measurements (`stochfuse.simplified`).
+prior, and so m arrivals make one Kalman update with m + 1 measurements (`stochfuse.prediction.simplified`).
 
 A *form* is one way to carry the recursion numerically: `MeasurementSpace` (scalar models included), `SquareRoot` where
 the former would cancel, and `Outcomes` for unlike agents.  An *item* is one column of the batch: a row of link
@@ -19,8 +19,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from stochfuse.arrivals import Arrivals
-from stochfuse.averaged import (
+from stochfuse.kalman.arrivals import Arrivals
+from stochfuse.kalman.averaged_update import (
     noise_factor,
     prior_map,
     smallest_pivot,
@@ -30,9 +30,11 @@ from stochfuse.averaged import (
     update_scalar,
     upper,
 )
-from stochfuse.engines.numbers import AsTheyAre, Numbers
-from stochfuse.kalman import (
+from stochfuse.kalman.kernel import (
+    AsTheyAre,
     Information,
+    Numbers,
+    at_step,
     factor,
     from_factor,
     join_factors,
@@ -40,7 +42,7 @@ from stochfuse.kalman import (
     update_factor,
     update_information,
 )
-from stochfuse.model import Model, Noises, Sensor, at_step
+from stochfuse.scenario.model import Model, Noises, Sensor
 
 CANCELLATION = 1e-5
 """Share of prior variance left by an update, below which the square-root form takes over: 1e-16/1e-5 of an entry."""
@@ -136,7 +138,7 @@ class Case:
 
 
 class MeasurementSpace:
-    """Upper triangles with the items in the last axis; see `stochfuse.averaged`."""
+    """Upper triangles with the items in the last axis; see `stochfuse.kalman.averaged_update`."""
 
     def __init__(self, case: Case):
         self.case = case

@@ -18,10 +18,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.engines import uncollected
-from stochfuse.estimators import Claims, Estimator, Exchange, Late, Made
-from stochfuse.events import Event
-from stochfuse.kalman import Estimate
+from stochfuse.engines.events import Event
+from stochfuse.engines.progress import uncollected
+from stochfuse.estimators.protocol import Claims, Estimator, Exchange, Late, Made
+from stochfuse.kalman.kernel import Estimate
 
 BLOCK = 1000
 """Runs drawn from one seed."""

@@ -15,11 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse.estimators.pasts import Rule
-from stochfuse.estimators.recursion import RecursiveEstimator, Worked
+from stochfuse.estimators.recursion import RecursiveEstimator, Rule, Worked
+from stochfuse.estimators.world import World
 from stochfuse.fusion.blender import Blend, blend_all, blend_tree
 from stochfuse.fusion.parallel import ParallelFilter, ParallelFilters, parallel_filters
-from stochfuse.world import World
 
 BLEND = "blend"
 

@@ -17,12 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse.estimators import Late
-from stochfuse.estimators.pasts import Rule
-from stochfuse.estimators.recursion import PastExchange, RecursiveEstimator, State, Worked
+from stochfuse.estimators.protocol import Late
+from stochfuse.estimators.recursion import PastExchange, RecursiveEstimator, Rule, State, Worked
 from stochfuse.fusion.cooperative import itns_update, lwin_update
-from stochfuse.kalman import Estimate, factor, predict
-from stochfuse.model import at_step
+from stochfuse.kalman.kernel import Estimate, at_step, factor, predict
 
 AGREED, RELATED, JOINT, JOINT_LOCAL, BLOCK = "agreed", "related", "joint", "joint local", "block"
 

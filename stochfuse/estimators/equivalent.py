@@ -17,16 +17,14 @@ from typing import Any
 import numpy as np
 
 from stochfuse.errors import UsageError
-from stochfuse.estimators.pasts import Rule
-from stochfuse.estimators.recursion import RecursiveEstimator, Worked
+from stochfuse.estimators.recursion import RecursiveEstimator, Rule, Worked
 from stochfuse.fusion.equivalent_measurement import (
     Equivalent,
     actual_error,
     equivalent_measurement,
     independent_measurement,
 )
-from stochfuse.kalman import Estimate, corrected, gain, predict
-from stochfuse.model import at_step
+from stochfuse.kalman.kernel import Estimate, at_step, corrected, gain, predict
 
 MEASURED = "measured"
 

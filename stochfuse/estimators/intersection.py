@@ -22,10 +22,9 @@ from typing import Any
 import numpy as np
 
 from stochfuse.errors import UsageError
-from stochfuse.estimators.pasts import Rule
-from stochfuse.estimators.recursion import RecursiveEstimator, Worked
-from stochfuse.fusion.covariance_intersection import Criterion, Stack, fuse_stack
-from stochfuse.world import World
+from stochfuse.estimators.recursion import RecursiveEstimator, Rule, Worked
+from stochfuse.estimators.world import World
+from stochfuse.fusion.intersection import Criterion, Stack, fuse_stack
 
 TOGETHER, RELATED = "intersection", "related intersection"
 

@@ -27,8 +27,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from stochfuse.estimators import FusionRule, Late, best_relabelling
-from stochfuse.information import COMMON, Ledger
+from stochfuse.estimators.ledger import COMMON, Ledger
+from stochfuse.estimators.protocol import FusionRule, Late, best_relabelling
 
 
 class Agent(NamedTuple):

@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from stochfuse.estimators import FusionRule, Late, in_least_order
-from stochfuse.information import COMMON
+from stochfuse.estimators.ledger import COMMON
+from stochfuse.estimators.protocol import FusionRule, Late, in_least_order
 
 
 class State(NamedTuple):

@@ -13,8 +13,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from stochfuse.estimators import FusionRule, Late, best_relabelling
-from stochfuse.information import COMMON, Ledger
+from stochfuse.estimators.ledger import COMMON, Ledger
+from stochfuse.estimators.protocol import FusionRule, Late, best_relabelling
 
 Held = tuple[int, ...]
 """Agents whose measurement of step 1, 2, … is held, as masks."""

@@ -1,4 +1,4 @@
 """Fusion of estimates and measurements, one rule a file: pure functions over stacks of arrays, no network.
 
-The estimators (`stochfuse.estimators`) carry these rules over lossy links.
+The estimators (`stochfuse.estimators.protocol`) carry these rules over lossy links.
 """

@@ -35,9 +35,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.algebra import NUMPY
-from stochfuse.checks import covariance_fault
 from stochfuse.errors import UsageError
+from stochfuse.kalman.algebra import NUMPY
+from stochfuse.kalman.checks import covariance_fault
 
 RANK = 1e-12
 """Largest eigenvalue of the differences' covariance, in units of the filters' variances, that is taken for zero."""

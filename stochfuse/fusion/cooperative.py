@@ -33,7 +33,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.errors import UsageError
-from stochfuse.kalman import Estimate, update
+from stochfuse.kalman.kernel import Estimate, update
 
 KINDS = ("range", "direction", "both", "difference")
 COINCIDENT = 1e-9

@@ -40,9 +40,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import root_scalar
 
-from stochfuse.algebra import NUMPY
 from stochfuse.errors import NoAnswerError, UsageError
 from stochfuse.fusion.blender import RANK, blend_all, references, semidefinite, spectrum
+from stochfuse.kalman.algebra import NUMPY
 
 REACH = 1e8
 """Largest factor between ε and √(tr Δ / tr R) for which it is sought."""

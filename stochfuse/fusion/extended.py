@@ -1,4 +1,4 @@
-"""The extended Kalman filter: the kernel of `stochfuse.kalman` around functions of the state.
+"""The extended Kalman filter: the kernel of `stochfuse.kalman.kernel` around functions of the state.
 
     predict   x̂⁻ = f(x̂)                    P⁻ = F P Fᵀ + Q             F = ∂f/∂x at x̂
     update    x̂ = x̂⁻ + K(z − h(x̂⁻))        P and K as for a linear H     H = ∂h/∂x at x̂⁻
@@ -16,8 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stochfuse.errors import UsageError
-from stochfuse.kalman import Estimate, predict, update
-from stochfuse.model import at_step
+from stochfuse.kalman.kernel import Estimate, at_step, predict, update
 
 STEP = float(np.cbrt(np.finfo(float).eps))
 """Step of a central difference in units of the state's size: errors of rounding and of curvature are then alike."""

@@ -33,7 +33,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stochfuse.algebra import NUMPY
 from stochfuse.errors import UsageError
 from stochfuse.fusion.trajectory import (
     EARTH_RATE,
@@ -44,6 +43,7 @@ from stochfuse.fusion.trajectory import (
     radii,
     transport_rate,
 )
+from stochfuse.kalman.algebra import NUMPY
 
 STATES = (
     *("tiltN", "tiltE", "yaw", "vN", "vE", "vD", "pN", "pE", "pD"),

@@ -15,11 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stochfuse.algebra import NUMPY
 from stochfuse.errors import NoAnswerError, UsageError
 from stochfuse.fusion.blender import semidefinite, size_of
-from stochfuse.kalman import Estimate, gain, predict
-from stochfuse.model import at_step
+from stochfuse.kalman.algebra import NUMPY
+from stochfuse.kalman.kernel import Estimate, at_step, gain, predict
 
 Cross = Mapping[tuple[int, int], np.ndarray]
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from stochfuse import __version__
-from stochfuse.crosscheck import Cell, Verdict
+from stochfuse.questions.crosscheck import Cell, Verdict
+from stochfuse.questions.results import Results
 from stochfuse.report.predictions import View, counted
 from stochfuse.report.table import Table, number, to_csv
-from stochfuse.results import Results
 
 SCHEMA = "stochfuse.crosscheck/1"
 

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import sympy
 
 from stochfuse import __version__
-from stochfuse.symbolic import FIXED, MOST_AGENTS_CLEARED, MU, SimplifiedForm
-from stochfuse.symbolic_general import GeneralForm
+from stochfuse.symbolic.general import GeneralForm
+from stochfuse.symbolic.simplified import FIXED, MOST_AGENTS_CLEARED, MU, SimplifiedForm
 
 SCHEMA = "stochfuse.derivation/1"
 

@@ -11,11 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse import __version__
-from stochfuse.fusion_graph import Explanation, FusionGraph, Node, Term
-from stochfuse.metrics import Metric
-from stochfuse.report.export import write_file
+from stochfuse.estimators.fusion_graph import Explanation, FusionGraph, Node, Term
+from stochfuse.kalman.metrics import Metric
 from stochfuse.report.plot import figure_class
-from stochfuse.report.table import number
+from stochfuse.report.table import number, write_file
 
 SCHEMA = "stochfuse.fusion-graph/1"
 REMOVED, OWN, OTHER = "#f4b183", "#9dc3e6", "#ffffff"

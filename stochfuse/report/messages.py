@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 
 from stochfuse import __version__
-from stochfuse.messages import IDENTITY_BYTES, NUMBER_BYTES, Accuracy, Bytes, MessageLoad, in_bytes
-from stochfuse.metrics import Metric
-from stochfuse.report.export import write_file
+from stochfuse.kalman.metrics import Metric
+from stochfuse.questions.messages import IDENTITY_BYTES, NUMBER_BYTES, Accuracy, Bytes, MessageLoad, in_bytes
 from stochfuse.report.plot import MARKERS, figure_class, spread
 from stochfuse.report.predictions import View
-from stochfuse.report.table import Table, number, to_csv
+from stochfuse.report.table import Table, number, to_csv, write_file
 
 SCHEMA = "stochfuse.messages/1"
 SHORT = {"local-fusion-graph": "LFG", "naive": "naive"}

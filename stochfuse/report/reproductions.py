@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from stochfuse import __version__
-from stochfuse.report.export import write_file
 from stochfuse.report.plot import MARKERS, figure_class
-from stochfuse.report.table import Table, number, to_csv
+from stochfuse.report.table import Table, number, to_csv, write_file
 
 SCHEMA = "stochfuse.reproduction/1"
 VERDICTS = ("agrees", "differs", "explained", "open")

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from stochfuse.errors import NoAnswerError, UsageError
-from stochfuse.report.study_words import HOW, shortened, words_of
-from stochfuse.studies.axes import Axis
+from stochfuse.report.studies import HOW, shortened, words_of
 from stochfuse.studies.pareto import holds
-from stochfuse.studies.plan import ERROR, Plan
+from stochfuse.studies.plan import ERROR, Axis, Plan
 
 if TYPE_CHECKING:
-    from stochfuse.studies.results import Results
+    from stochfuse.studies.files import Results
 
 MOST_DRAWN = 5_000
 """Scattered points beyond which a figure shows only some."""

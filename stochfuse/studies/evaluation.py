@@ -13,15 +13,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse import batches
-from stochfuse.checks import LARGEST, covariance_fault, first_fault
-from stochfuse.conditioning import told
 from stochfuse.engines.enumeration import TooManyError
+from stochfuse.engines.precision import told
 from stochfuse.errors import NoAnswerError, ScenarioError, StochfuseError
-from stochfuse.messages import message_load
-from stochfuse.methods import predict_several
-from stochfuse.model import Noises
-from stochfuse.prediction import Prediction
-from stochfuse.scenario import Scenario
+from stochfuse.kalman.checks import LARGEST, covariance_fault, first_fault
+from stochfuse.prediction.predict import predict_several
+from stochfuse.prediction.result import Prediction
+from stochfuse.questions.messages import message_load
+from stochfuse.scenario.model import Noises
+from stochfuse.scenario.scenario import Scenario
 from stochfuse.studies.plan import ERROR, MESSAGES, NODES, SETTINGS, Plan, default_method, put
 
 LINK, Q, R, P0 = "network.link", "model.Q", "model.R", "initial.P"

@@ -24,7 +24,7 @@ from stochfuse.errors import NoAnswerError, UsageError
 from stochfuse.studies.plan import ERROR, NODES, Plan
 
 if TYPE_CHECKING:
-    from stochfuse.studies.results import Results
+    from stochfuse.studies.files import Results
 
 COSTS = ("claimed", "actual", "optimal", "rms")
 """Quantities of which less is better."""

@@ -1,4 +1,23 @@
-"""A study file, read and checked: what fits together becomes a plan.
+"""The structure of a study file, for pydantic.
+
+    schema = "stochfuse.study/1"
+    scenario = "cv-2d"                                    # a preset, a file, or a [scenario] table
+    [vary]                                                # scenario keys, and method, estimator, …
+    "network.link" = { from = 0, to = 1, number = 11 }
+    "model.R" = { from = 1, to = 1e4, number = 13, scale = "log" }
+    method = ["simplified", "general"]
+    [design]                                              # default: the grid of all combinations
+    kind = "latin-hypercube"
+    points = 1000
+    [predict]                                             # what holds for every point
+    [report]                                              # what is tabulated
+    quantity = ["claimed", "messages"]
+
+Whether the values fit the scenario is found out point by point, see `stochfuse.studies.evaluation`.
+
+What a study varies: listed values of a key, or a range of a Latin hypercube.
+
+A study file, read and checked: what fits together becomes a plan.
 
 Whether the values of a key fit the scenario is found out point by point; here, whether there is such a key.
 """
@@ -16,17 +35,16 @@ from typing import Any
 import numpy as np
 
 from stochfuse import __version__
-from stochfuse.checks import Checker, shown
 from stochfuse.errors import Problem, ScenarioError, StochfuseError, UsageError
-from stochfuse.metrics import metric as metric_of
-from stochfuse.names import CRITERIA, ESTIMATORS, METHODS
-from stochfuse.quantities import QUANTITIES
-from stochfuse.quantities import check as check_quantity
-from stochfuse.scenario import Scenario, is_preset, parse, read_file, read_text
-from stochfuse.studies.axes import Axis, read_axes
-from stochfuse.studies.plan import KEY, MESSAGES, SETTINGS, Plan, put
-from stochfuse.studies.schema import EXPECTED, StudyFile
-from stochfuse.tables.schema import problems_of, structure_problems
+from stochfuse.kalman.checks import shown
+from stochfuse.kalman.metrics import metric as metric_of
+from stochfuse.prediction.quantities import QUANTITIES
+from stochfuse.prediction.quantities import check as check_quantity
+from stochfuse.scenario.checker import Checker
+from stochfuse.scenario.registry import CRITERIA, ESTIMATORS, METHODS
+from stochfuse.scenario.scenario import Scenario, is_preset, parse, read_file, read_text
+from stochfuse.scenario.schema import problems_of, structure_problems
+from stochfuse.studies.plan import EXPECTED, KEY, MESSAGES, SETTINGS, Axis, Plan, StudyFile, put, read_axes
 
 _WORDS = {"method": METHODS, "estimator": ESTIMATORS, "criterion": CRITERIA}
 _LEAST = {"runs": 2, "seed": 0, "max_graphs": 1}

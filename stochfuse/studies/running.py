@@ -28,11 +28,10 @@ from typing import Any
 
 from stochfuse.errors import StochfuseError, UsageError
 from stochfuse.studies.evaluation import evaluate
+from stochfuse.studies.files import Results, check_format, packed, unpacked, write_result
 from stochfuse.studies.journal import DamagedError, Journal
 from stochfuse.studies.plan import Plan
 from stochfuse.studies.reading import load_study, plan_of, software
-from stochfuse.studies.results import Results
-from stochfuse.studies.writing import check_format, packed, unpacked, write_result
 
 WAITING = 3
 """Chunks that are handed out for each worker: enough to keep it busy, few enough to hold little."""

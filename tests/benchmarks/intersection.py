@@ -13,7 +13,7 @@ import mpmath as mp
 import numpy as np
 from scipy.optimize import minimize_scalar, root_scalar
 
-from stochfuse.fusion.covariance_intersection import Criterion, fuse_stack, pair_weights
+from stochfuse.fusion.intersection import Criterion, fuse_stack, pair_weights
 from tests.benchmarks.chain import seconds
 
 D = 4

@@ -13,7 +13,7 @@ import numpy as np
 
 import stochfuse as sf
 from stochfuse import batches
-from stochfuse.model import Noises
+from stochfuse.scenario.model import Noises
 from tests.benchmarks.growth import Growth, draw, seconds
 
 HEADINGS = ("work", "time", "memory", "rate", "promised")

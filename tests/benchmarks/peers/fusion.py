@@ -15,7 +15,7 @@ from scipy.optimize import minimize_scalar
 from stonesoup.mixturereducer.gaussianmixture import CovarianceIntersection
 from stonesoup.types.state import GaussianState
 
-from stochfuse.fusion.covariance_intersection import Criterion, Stack, fuse_stack
+from stochfuse.fusion.intersection import Criterion, Stack, fuse_stack
 from tests import textbook
 from tests.benchmarks.intersection import D, random_pairs, scipy_loop
 from tests.benchmarks.peers.ways import OURS, STONE_SOUP, Row, Section, Way, agreed, timed

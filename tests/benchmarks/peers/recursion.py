@@ -22,9 +22,9 @@ from stonesoup.types.state import GaussianState
 from stonesoup.updater.kalman import KalmanUpdater
 
 import stochfuse as sf
-from stochfuse import kalman
 from stochfuse.batches import simplified
-from stochfuse.model import Noises
+from stochfuse.kalman import kernel as kalman
+from stochfuse.scenario.model import Noises
 from tests import textbook
 from tests.benchmarks.peers.ways import (
     FILTERPY,

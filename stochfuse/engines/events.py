@@ -1,0 +1,418 @@
+"""What may arrive in a step, and how likely: the events of (44)–(46).
+
+A step draws independent events: every ordered pair of agents in an ad hoc network, every sender in a broadcast one,
+every agent's one link in a cyclic one.  An event succeeds with probability µ, and everyone it concerns then hears the
+sender, at once or after a delay that is drawn with it.  Sets of agents are masks, bit i for agent i.
+
+Bookkeeping of how likely outcomes are, while they are gone through.
+
+With equal µ everywhere, an outcome with c successes of L events has probability µ^c (1−µ)^(L−c): the `Counts` and
+`Coefficients` weights keep the factor of every c apart (theory section 5), so that one enumeration answers every µ.
+`Rows` keeps one probability per row of link probabilities instead, and `Bursty` one for every row and every way in
+which the links can be good and bad.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import permutations
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from stochfuse.errors import UsageError
+from stochfuse.estimators.protocol import Late
+from stochfuse.scenario.network import LinkRows, Network, possible_senders
+
+if TYPE_CHECKING:
+    from stochfuse.engines.events import Event, Fate
+
+
+MOST_AGENTS_RELABELLED = 7
+"""Agents up to which relabellings are looked for: their number grows with the factorial."""
+
+
+class Event(NamedTuple):
+    """One draw of a step: who sends, who hears it, and with which probability in each row.
+
+    Of a bursty link `probability` is the mean; `burst` (rows, 4) says how it comes about, and `number` which link it is
+    among those of every step.
+    """
+
+    sender: int
+    receivers: tuple[int, ...]
+    probability: np.ndarray
+    burst: np.ndarray | None = None
+    number: int = 0
+
+
+class Fate(NamedTuple):
+    """What became of an event: a delay, or None if nothing will come of it; and the weight of that."""
+
+    delay: int | None
+    missed: Any
+    arrived: Any
+
+
+class Outcome(NamedTuple):
+    """Which agents each agent hears in a step (itself included), what is under way, and the outcome's factor."""
+
+    heard: tuple[int, ...]
+    late: tuple[Late, ...]
+    factor: Any
+
+
+def events(network: Network, rows: LinkRows, step: int) -> list[Event]:
+    """Events of a step, those that are impossible in every row left out where links differ."""
+    n, senders = network.agents, possible_senders(network.architecture, network.agents)
+    µ = rows.matrices(network, step)
+    if network.architecture == "broadcast":
+        place = {(i, j): p for i in range(n) for p, j in enumerate(senders[i])}
+        listeners = {j: tuple(i for i in range(n) if i != j) for j in range(n)}
+        found = [Event(j, heard, µ[:, heard[0], place[heard[0], j]]) for j, heard in listeners.items() if heard]
+    else:
+        found = [Event(int(j), (i,), µ[:, i, p]) for i in range(n) for p, j in enumerate(senders[i])]
+    if rows.bursts is not None:
+        return [e._replace(burst=rows.chain(e.probability), number=number) for number, e in enumerate(found)]
+    # with one µ for all links the answer is a polynomial in µ, whatever values of µ are asked for
+    return [event for event in found if rows.uniform or (event.probability > 0).any()]
+
+
+def fates(delay: Sequence[float], left: int) -> list[Fate]:
+    """What may become of an event with so many steps left: lost or too late, or heard after each possible delay."""
+    in_time = delay[: left + 1]
+    too_late = 1.0 - sum(in_time) if left + 1 < len(delay) else 0.0
+    return [Fate(None, 1.0, too_late), *(Fate(d, 0.0, p) for d, p in enumerate(in_time) if p > 0)]
+
+
+def relabellings(network: Network, rows: LinkRows, sources: Sequence[int]) -> list[tuple[int, ...]]:
+    """Permutations of the agents that change neither sources, nor who may hear whom, nor how likely."""
+    n = network.agents
+    if n > MOST_AGENTS_RELABELLED:
+        return [tuple(range(n))]
+    steps = range(1, network.steps + 1 if rows.varies else 2)
+    link = np.zeros((len(steps), len(rows.link), n, n))
+    for k, step in enumerate(steps):
+        for i, (senders, µ) in enumerate(
+            zip(possible_senders(network.architecture, n), np.moveaxis(rows.matrices(network, step), 1, 0), strict=True)
+        ):
+            link[k][:, i, senders] = µ + 1.0  # told apart from a link that does not exist
+    found = []
+    for p in permutations(range(n)):
+        order = list(p)
+        if all(sources[a] == sources[i] for i, a in enumerate(p)) and (link == link[..., order, :][..., order]).all():
+            found.append(p)
+    return found
+
+
+def orbits(n: int, permutations: Sequence[tuple[int, ...]]) -> list[tuple[int, ...]]:
+    """Agents that some relabelling takes into one another, as sorted groups."""
+    group = list(range(n))
+    for p in permutations:
+        for i, a in enumerate(p):
+            low, high = sorted((group[i], group[a]))
+            group = [low if g == high else g for g in group]
+    return [tuple(i for i in range(n) if group[i] == g) for g in sorted(set(group))]
+
+
+def outcomes(drawn: Sequence[Event], agents: int, delay: Sequence[float], left: int, weights: Weights) -> list[Outcome]:
+    """Every outcome of a step that has a positive probability in some row.
+
+    Parameters
+    ----------
+    drawn : the step's events.
+    left : steps left after this one; what arrives later does not matter.
+    """
+    choices = fates(delay, left)
+    whole = [Outcome(tuple(1 << i for i in range(agents)), (), weights.none())]
+    for event in drawn:
+        options = [(fate, weights.factor(event, fate)) for fate in choices]
+        if isinstance(weights, Rows):
+            options = [(fate, factor) for fate, factor in options if np.any(factor)]
+        whole = [
+            Outcome(
+                _heard(outcome.heard, event, fate),
+                outcome.late + _late(event, fate),
+                weights.both(outcome.factor, factor),
+            )
+            for outcome in whole
+            for fate, factor in options
+        ]
+    return whole
+
+
+def concerning(drawn: Sequence[Event], agents: Sequence[int]) -> list[Event]:
+    """Events that concern some agents."""
+    return [event for event in drawn if set(event.receivers) & set(agents)]
+
+
+def _heard(heard: tuple[int, ...], event: Event, fate: Fate) -> tuple[int, ...]:
+    if fate.delay != 0:
+        return heard
+    return tuple(h | 1 << event.sender if i in event.receivers else h for i, h in enumerate(heard))
+
+
+def _late(event: Event, fate: Fate) -> tuple[Late, ...]:
+    if not fate.delay:
+        return ()
+    return tuple(Late(receiver, fate.delay, event.sender) for receiver in event.receivers)
+
+
+MOST_HIDDEN = 1 << 14
+"""Rows times ways in which bursty links can be good and bad."""
+
+
+class _Memoryless:
+    """Weights of links whose steps are independent."""
+
+    memory = False
+
+    def between(self, weights: list[Any]) -> list[Any]:
+        """Weights of states before the next step's exchange, from those after this one's."""
+        return weights
+
+    def collected(self, total: np.ndarray) -> np.ndarray:
+        """Return what is known on the weights' axis without what is hidden."""
+        return total
+
+
+class _Polynomial(_Memoryless):
+    """Coefficients A_c of µ^c (1−µ)^(L−c) on an axis of L + 1 entries."""
+
+    def product(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Weights of two independent parts together."""
+        return np.convolve(a, b)
+
+    def total(self, states: np.ndarray, cells: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Σ states · cells · values over states and groups of cells, shape (degrees + 1, …)."""
+        flat = values.reshape(*values.shape[:2], -1)
+        first = np.tensordot(states.T, flat, axes=1)
+        pairs = np.einsum("hm,chv->cmv", cells, first)
+        out = np.zeros((sum(pairs.shape[:2]) - 1, pairs.shape[2]))
+        for c, row in enumerate(pairs):
+            out[c : c + len(row)] += row
+        return out.reshape(-1, *values.shape[2:])
+
+    def weighed(self, total: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """Σ_c total times an independent part's weight."""
+        out = np.zeros((len(total) + len(weight) - 1, *total.shape[1:]))
+        for c, w in enumerate(weight):
+            out[c : c + len(total)] += w * total
+        return out
+
+    def completed(self, total: np.ndarray, degree: int) -> np.ndarray:
+        """Return the same with events that do not matter counted in, so that L is the degree."""
+        while len(total) <= degree:
+            grown = np.zeros((len(total) + 1, *total.shape[1:]))
+            grown[:-1] += total
+            grown[1:] += total
+            total = grown
+        return total
+
+
+@dataclass(frozen=True)
+class Counts(_Polynomial):
+    """Weights by number of successes, equal µ: outcomes counted exactly, packed into one integer, `bits` apiece."""
+
+    bits: int
+
+    def one(self) -> int:
+        """Weight of the start."""
+        return 1
+
+    def factor(self, event: Event, fate: Fate) -> Any:
+        """Shift of one event's fate."""
+        return 0 if fate.delay is None else self.bits
+
+    def both(self, a: Any, b: Any) -> Any:
+        """Shift of two events together."""
+        return a + b
+
+    def none(self) -> Any:
+        """Shift of no event."""
+        return 0
+
+    def times(self, weight: int, factor: int) -> int:
+        """Weight after an outcome."""
+        return weight << factor
+
+    def table(self, weights: Sequence[Any], degree: int) -> np.ndarray:
+        """Numbers of outcomes by number of successes, shape (weights, degree + 1)."""
+        return np.array(self.exactly(weights, degree), dtype=float)
+
+    def exactly(self, weights: Sequence[Any], degree: int) -> list[list[int]]:
+        """Return the same as integers."""
+        mask = (1 << self.bits) - 1
+        return [[w >> c * self.bits & mask for c in range(degree + 1)] for w in weights]
+
+    def factors(self, factors: Sequence[Any], degree: int) -> np.ndarray:
+        """Outcomes' factors as coefficients, shape (factors, degree + 1)."""
+        return np.eye(degree + 1)[[factor // self.bits for factor in factors]]
+
+
+@dataclass(frozen=True)
+class Coefficients(_Polynomial):
+    """Weights by number of successes, equal µ with delays: coefficients of µ^c (1−µ)^(L−c)."""
+
+    def one(self) -> np.ndarray:
+        """Weight of the start, or of no event."""
+        return np.ones(1)
+
+    none = one
+
+    def factor(self, event: Event, fate: Fate) -> np.ndarray:
+        """Coefficients of one event's fate."""
+        return np.array([fate.missed, fate.arrived])
+
+    def both(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Coefficients of two events together."""
+        return np.convolve(a, b)
+
+    times = both
+
+    def table(self, weights: Sequence[Any], degree: int) -> np.ndarray:
+        """Coefficients, shape (weights, degree + 1)."""
+        return np.array(weights)
+
+    factors = table
+
+
+@dataclass(frozen=True)
+class Rows(_Memoryless):
+    """Weights as one probability per row."""
+
+    rows: int
+
+    def one(self) -> np.ndarray:
+        """Weight of the start, or of no event."""
+        return np.ones(self.rows)
+
+    none = one
+
+    def factor(self, event: Event, fate: Fate) -> np.ndarray:
+        """Probabilities of one event's fate."""
+        µ = event.probability
+        return fate.missed * (1.0 - µ) + fate.arrived * µ
+
+    def both(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Probabilities of two events together."""
+        return a * b
+
+    times = both
+    product = both
+
+    def table(self, weights: Sequence[Any], degree: int) -> np.ndarray:
+        """Probabilities, shape (weights, rows)."""
+        return np.array(weights)
+
+    factors = table
+
+    def total(self, states: np.ndarray, cells: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Σ states · cells · values over states and groups of cells, shape (rows, …)."""
+        flat = values.reshape(*values.shape[:2], -1)
+        return np.einsum("gr,hr,ghv->rv", states, cells, flat, optimize=True).reshape(-1, *values.shape[2:])
+
+    def weighed(self, total: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """Total times an independent part's weight."""
+        return total * weight.reshape(-1, *(1,) * (total.ndim - 1))
+
+    def completed(self, total: np.ndarray, degree: int) -> np.ndarray:
+        """Return the total: probabilities are complete."""
+        return total
+
+
+@dataclass(frozen=True)
+class Bursty(Rows):
+    """Weights as one probability per row and hidden state, which says of every link (bit by its number) if it is bad.
+
+    Parameters
+    ----------
+    rows : entries of the axis: rows times hidden states.
+    links : number of links.
+    moves : (links, rows proper, 2, 2) probability to go from state to state (0 good, 1 bad).
+    """
+
+    links: int
+    moves: np.ndarray
+
+    memory = True
+
+    def one(self) -> np.ndarray:
+        """Stationary distribution of the hidden states, in every row."""
+        total = np.ones((self.moves.shape[1], 1))
+        for move in self.moves:  # a later link is a higher bit
+            bad = move[:, 0, 1] / (move[:, 0, 1] + move[:, 1, 0])
+            total = np.concatenate([total * (1.0 - bad)[:, None], total * bad[:, None]], axis=1)
+        return total.ravel()
+
+    def factor(self, event: Event, fate: Fate) -> np.ndarray:
+        """Probabilities of one event's fate in every hidden state."""
+        if event.burst is None:
+            raise ValueError("expected an event of a bursty link")
+        bad = np.arange(1 << self.links) >> event.number & 1
+        µ = np.where(bad, event.burst[:, 3:], event.burst[:, 2:3]).ravel()
+        return fate.missed * (1.0 - µ) + fate.arrived * µ
+
+    def between(self, weights: list[Any]) -> list[Any]:
+        """Let every link stay or change."""
+        rows, links = self.moves.shape[1], self.links
+        table = np.array(weights)
+        for link, move in enumerate(self.moves):
+            parts = table.reshape(len(weights), rows, 1 << (links - 1 - link), 2, 1 << link)
+            table = np.einsum("wrasb,rst->wratb", parts, move).reshape(len(weights), -1)
+        return list(table)
+
+    def collected(self, total: np.ndarray) -> np.ndarray:
+        """Sum over the hidden states."""
+        return total.reshape(self.moves.shape[1], -1, *total.shape[1:]).sum(axis=1)
+
+
+Weights = Counts | Coefficients | Rows
+
+
+def bursty(drawn: Sequence[Event], rows: int) -> Bursty:
+    """Return the bookkeeping for bursty links.
+
+    Raises
+    ------
+    UsageError
+        If the hidden states are too many.
+    """
+    if rows << len(drawn) > MOST_HIDDEN:
+        raise UsageError(
+            f"{len(drawn)} bursty links are good and bad in 2^{len(drawn)} ways, for {rows} rows too many to go "
+            f"through (at most {MOST_HIDDEN}): use --method optimal or --method monte-carlo"
+        )
+    bursts = [event.burst for event in drawn if event.burst is not None]
+    moves = np.array([[[[1 - g, g], [b, 1 - b]] for g, b, _, _ in burst] for burst in bursts])
+    return Bursty(rows << len(drawn), len(drawn), moves.reshape(len(drawn), rows, 2, 2))
+
+
+def weights_for(network: Network, rows: LinkRows, number_of_events: int) -> Weights:
+    """Return the cheapest exact bookkeeping: by number of successes where all µ are equal, else by row."""
+    if not rows.uniform or rows.varies:
+        return Rows(len(rows.link))
+    return Counts(number_of_events + 1) if network.delay == (1.0,) else Coefficients()
+
+
+def bernstein(coefficients: np.ndarray, degree: int, link: np.ndarray) -> np.ndarray:
+    """Σ_c A_c µ^c (1−µ)^(L−c) for every µ.
+
+    Parameters
+    ----------
+    coefficients : (degree + 1, ...) A_c.
+    link : (rows,) µ.
+
+    Returns
+    -------
+    ndarray
+        (rows, ...)
+    """
+    return np.tensordot(monomials(degree, link), coefficients, axes=1)
+
+
+def monomials(degree: int, link: np.ndarray) -> np.ndarray:
+    """µ^c (1−µ)^(L−c) for c = 0 … L, shape (rows, degree + 1)."""
+    c = np.arange(degree + 1)
+    return link[:, None] ** c * (1.0 - link[:, None]) ** (degree - c)

@@ -1,0 +1,407 @@
+"""Information as expressions: what an estimate is made of, before any number is put in.
+
+The information (inverse covariance) of every estimate in a fusion network is a sum with whole coefficients,
+
+    Y(k) = Σ c · atom,      atom:  the start      P(k0)⁻¹
+                                   a measurement  HᵀR⁻¹H of one sensor at step k
+                                   a prior        TU(P)⁻¹, some earlier estimate's information brought to step k
+
+and the information vector y = Y x̂ is the same sum of the atoms' vectors.  A `Ledger` gives equal sums one number, so
+that a search through millions of outcomes compares numbers, terms that cancel never meet in floating point, and the
+whole is evaluated once for every distinct sum: over NumPy in one batch per step, or over an exact field.
+
+Equations: local estimate (24)–(27) in information form, Y(k|k) = TU(P(k−1))⁻¹ + HᵀR⁻¹H; fusion (2)/(3) adds up.
+
+Values under numbers, when agents of one kind change places: what ledgers of sums and of pasts share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from stochfuse.errors import NoAnswerError, UsageError
+from stochfuse.kalman.algebra import NUMPY, Algebra
+from stochfuse.kalman.kernel import (
+    Estimate,
+    Information,
+    at_step,
+    from_information,
+    predict,
+    predict_information,
+    to_information,
+    update_information,
+)
+from stochfuse.scenario.model import Model, Sensor
+
+START, MEASURED, PRIOR = "start", "measured", "prior"
+COMMON = -1
+"""Source of an initial estimate that all agents share."""
+
+
+class Renamed:
+    """Numbers for values that name agents.
+
+    Parameters
+    ----------
+    kinds : kind of each agent, where agents may change places with others of their kind; None: a value stays itself.
+    by_kind : where values are written with kinds in the place of agents, or None with `kinds`.
+    """
+
+    def __init__(self, kinds: Sequence[int] | None, by_kind: Any) -> None:
+        self._kinds, self._by_kind = kinds, by_kind
+        self._kind_of: dict[int, int] = {}
+        self._moved: dict[tuple[int, ...], dict[int, int]] = {}
+
+    def invariant(self, value: int) -> int:
+        """Return a number that stays the same when agents of one kind change places."""
+        if self._kinds is None:
+            return value
+        return self._renamed(value, self._by_kind, self._kinds, self._kind_of)
+
+    def moved(self, value: int, order: tuple[int, ...]) -> int:
+        """Return the value after agents changed places: place p is taken by agent order[p]."""
+        if self._kinds is None:
+            return value
+        place = [0] * len(order)
+        for p, agent in enumerate(order):
+            place[agent] = p
+        return self._renamed(value, self, place, self._moved.setdefault(order, {}))
+
+    def _renamed(self, value: int, into: Any, names: Sequence[int], known: dict[int, int]) -> int:
+        """Return the number, in another book, of a value whose agents got other names; `known` remembers."""
+        raise NotImplementedError
+
+
+class Ledger(Renamed):
+    """Numbers for distinct information sums; equal sums have equal numbers.
+
+    A value is a sum of atoms at one step.  Sources (of start and measurement atoms) are numbers that the caller gives:
+    kinds of sensors where only covariances matter, agents where their data do.
+
+    Parameters
+    ----------
+    kinds : kind of each source, where sources are agents that may change places with others of their kind; see `moved`.
+    """
+
+    def __init__(self, kinds: Sequence[int] | None = None) -> None:
+        self.atoms: list[tuple[str, int, int]] = []
+        self.step: list[int] = []
+        self.sums: list[tuple[tuple[int, int], ...]] = []
+        self._atom_of: dict[tuple[str, int, int], int] = {}
+        self._value_of: dict[tuple[int, tuple[tuple[int, int], ...]], int] = {}
+        self._prior_of: dict[int, int] = {}
+        self._local_of: dict[tuple[int, int], int] = {}
+        super().__init__(kinds, None if kinds is None else Ledger())
+
+    def start(self, source: int) -> int:
+        """Information of an initial estimate, at step 1."""
+        return self._value(1, ((self._atom(START, 1, source), 1),))
+
+    def local(self, value: int, source: int) -> int:
+        """The next step's local estimate: predicted from a fused value, with the source's own measurement."""
+        known = self._local_of.get((value, source))
+        if known is None:
+            known = self._local_of[value, source] = self.measured(value, (source,))
+        return known
+
+    def measured(self, value: int, sources: Sequence[int]) -> int:
+        """Return the value predicted to the next step, with the measurements of some sources there."""
+        step = self.step[value] + 1
+        atoms = {self._atom(PRIOR, step, value): 1}
+        for source in sources:
+            atom = self._atom(MEASURED, step, source)
+            atoms[atom] = atoms.get(atom, 0) + 1
+        return self._value(step, tuple(sorted(atoms.items())))
+
+    def forward(self, value: int, step: int) -> int:
+        """Return the value brought forward to a later step by the time update (24)."""
+        while self.step[value] < step:
+            known = self._prior_of.get(value)
+            if known is None:
+                later = self.step[value] + 1
+                known = self._prior_of[value] = self._value(later, ((self._atom(PRIOR, later, value), 1),))
+            value = known
+        return value
+
+    def combine(self, step: int, terms: Iterable[tuple[int, int]]) -> int:
+        """Σ coefficient · value over (value, coefficient), each brought forward to the step."""
+        total: dict[int, int] = {}
+        steps, sums = self.step, self.sums
+        for value, coefficient in terms:
+            for atom, times in sums[value if steps[value] == step else self.forward(value, step)]:
+                total[atom] = total.get(atom, 0) + coefficient * times
+        return self._value(step, tuple(sorted([pair for pair in total.items() if pair[1]])))
+
+    def _renamed(self, value: int, into: Ledger, names: Sequence[int], known: dict[int, int]) -> int:
+        new = known.get(value)
+        if new is None:
+            total: dict[int, int] = {}
+            for atom, times in self.sums[value]:
+                kind, step, of = self.atoms[atom]
+                if kind == PRIOR:
+                    of = self._renamed(of, into, names, known)
+                elif of != COMMON:
+                    of = names[of]
+                atom = into._atom(kind, step, of)
+                total[atom] = total.get(atom, 0) + times
+            atoms = tuple(sorted([pair for pair in total.items() if pair[1]]))
+            new = known[value] = into._value(self.step[value], atoms)
+        return new
+
+    def _atom(self, kind: str, step: int, of: int) -> int:
+        key = (kind, step, of)
+        known = self._atom_of.get(key)
+        if known is None:
+            known = self._atom_of[key] = len(self.atoms)
+            self.atoms.append(key)
+        return known
+
+    def _value(self, step: int, atoms: tuple[tuple[int, int], ...]) -> int:
+        key = (step, atoms)
+        known = self._value_of.get(key)
+        if known is None:
+            known = self._value_of[key] = len(self.sums)
+            self.sums.append(atoms)
+            self.step.append(step)
+        return known
+
+
+class Sources:
+    """What the atoms stand for: start and measurement information of every source, and how the state moves.
+
+    Parameters
+    ----------
+    model : state transition and process noise.
+    sensors : sensor of each source.
+    starts : information pair of each source's initial estimate (the last one's is that of `COMMON`); where there are
+        records, with y of shape (d, columns), one column for each world that is carried along.
+    records : measurements z of shape (steps, sources, p, columns), or None where only covariances matter.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        sensors: Sequence[Sensor],
+        starts: Sequence[Information],
+        records: Sequence[Sequence[Any]] | None = None,
+        algebra: Algebra = NUMPY,
+    ) -> None:
+        self.model, self.sensors, self.starts, self.records, self.algebra = model, sensors, starts, records, algebra
+
+    def measured(self, step: int, source: int) -> Information:
+        """Information of one measurement, HᵀR⁻¹H and HᵀR⁻¹z."""
+        sensor = self.sensors[source]
+        nothing = Information(None if self.records is None else 0 * self.starts[source].y, 0 * self.starts[source].Y)
+        z = None if self.records is None else self.records[step - 1][source]
+        return update_information(nothing, at_step(sensor.H, step), at_step(sensor.R, step), z, algebra=self.algebra)
+
+    def forward(self, information: Information, step: int) -> Information:
+        """Time update of an information pair (or a stack) from step − 1 to the step.
+
+        In information form, which inverts no covariance, wherever F has an inverse.
+        """
+        F, Q, Bu = (at_step(M, step) for M in (self.model.F, self.model.Q, self.model.Bu))
+        if self._invertible(step):
+            return predict_information(information, F, Q, Bu, algebra=self.algebra)
+        estimate = from_information(information, algebra=self.algebra)
+        return to_information(predict(estimate, F, Q, Bu, algebra=self.algebra), algebra=self.algebra)
+
+    def _invertible(self, step: int) -> bool:
+        F = at_step(self.model.F, step)
+        return F.dtype != object and np.linalg.cond(F) < 1e8
+
+
+def evaluate(ledger: Ledger, sources: Sources) -> Information:
+    """Every value of a ledger as floating-point numbers.
+
+    Returns
+    -------
+    Information
+        Y of shape (values, d, d) and y of shape (values, d, columns), None without records.  Sources of a batch: with
+        the items' axis after that of the values.
+
+    Raises
+    ------
+    NoAnswerError
+        If some value is no positive-definite information: nothing can be inferred from it.
+    UsageError
+        If a predicted covariance has no inverse.
+    """
+
+    def total(values: np.ndarray, atoms: np.ndarray) -> np.ndarray:
+        terms = [ledger.sums[value] for value in values]
+        which, times = np.array([pair for sum_ in terms for pair in sum_], dtype=int).T
+        first = np.cumsum([0] + [len(sum_) for sum_ in terms[:-1]])
+        return np.add.reduceat(times.reshape(-1, *(1,) * (atoms.ndim - 1)) * atoms[which], first, axis=0)
+
+    atoms, value_step = evaluate_atoms(ledger.atoms, sources, total), np.array(ledger.step)
+    values = np.empty((len(ledger.sums), *atoms.shape[1:]))
+    for step in np.unique(value_step):
+        here = np.flatnonzero(value_step == step)
+        values[here] = total(here, atoms)
+    return unpacked(values, sources)
+
+
+def evaluate_atoms(
+    atoms: Sequence[tuple[str, int, int]], sources: Sources, total: Callable[[np.ndarray, np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Every atom of a ledger as floating-point numbers, (atoms, …, d, width), Y and y side by side; see `unpacked`.
+
+    Parameters
+    ----------
+    atoms : of the ledger.
+    sources : what they stand for; of a batch, starts and noises have the items' axis before their own two.
+    total : sums up some of the ledger's values from all atoms; those of later steps do not hold numbers yet.
+
+    Raises
+    ------
+    NoAnswerError, UsageError
+        As `evaluate`.
+    """
+    start = sources.starts[0]
+    width = start.Y.shape[-1] + (0 if sources.records is None else start.y.shape[-1])
+    out = np.empty((len(atoms), *start.Y.shape[:-1], width))
+    of, atom_step = np.array([of for _, _, of in atoms]), np.array([step for _, step, _ in atoms])
+    prior = np.array([kind == PRIOR for kind, _, _ in atoms])
+    for step in range(1, int(atom_step.max()) + 1):
+        brought = np.flatnonzero(prior & (atom_step == step))
+        if len(brought):
+            before = unpacked(total(of[brought], out), sources)
+            check_definite(before.Y, step - 1, rounding=1e-9)
+            try:
+                out[brought] = _packed(sources.forward(before, step))
+            except np.linalg.LinAlgError:
+                raise UsageError(
+                    f"the covariance predicted for step {step} is singular, and the common information is its inverse: "
+                    "expected an invertible model.F, or a model.Q that fills what it leaves out"
+                ) from None
+        for atom in np.flatnonzero(~prior & (atom_step == step)).tolist():
+            kind, _, source = atoms[atom]
+            out[atom] = _packed(sources.starts[source] if kind == START else sources.measured(step, source))
+    return out
+
+
+class InformationClaims:
+    """What sums of information claim, see `stochfuse.estimators.protocol.Claims`.
+
+    Parameters
+    ----------
+    information : of every value of a ledger.
+    """
+
+    def __init__(self, information: Information) -> None:
+        d = information.Y.shape[-1]
+        self.information, y = information, information.y
+        self.width = d * max(d, 0 if y is None else y.shape[-1])
+        # the last entry, −1, stands for nothing
+        self._Y = np.concatenate([information.Y, np.zeros((1, d, d))])
+        self._y = None if y is None else np.concatenate([y, np.zeros_like(y[:1])])
+
+    def estimate(self, terms: Sequence[tuple[int, np.ndarray]], step: int) -> tuple[Estimate, float]:
+        """Estimates of a step from sums of values.
+
+        Raises
+        ------
+        NoAnswerError
+            If some sum is no positive-definite information.
+        """
+        Y: Any = sum(sign * self._Y[values] for sign, values in terms)
+        y = None if self._y is None else sum(sign * self._y[values] for sign, values in terms)
+        estimate, magnified = estimated(Information(y, Y), step)
+        return estimate, float(magnified.max())
+
+
+def estimated(information: Information, step: int) -> tuple[Estimate, np.ndarray]:
+    """Return estimates from information claimed at a step, and by how much rounding grew in each component, (..., d).
+
+    Raises
+    ------
+    NoAnswerError
+        If some information is not positive definite, or has no inverse in floating point.
+    """
+    check_definite(information.Y, step)
+    try:
+        estimate = from_information(information)
+    except np.linalg.LinAlgError:
+        raise NoAnswerError(
+            f"ill-conditioned: at step {step} the information claimed in some outcome is singular to rounding, and no "
+            "covariance follows"
+        ) from None
+    return estimate, _diagonal(estimate.P) * _diagonal(information.Y)
+
+
+def evaluate_exactly(ledger: Ledger, sources: Sources) -> list[Information]:
+    """Every value of a ledger over an exact field, one by one."""
+    atoms: dict[int, Information] = {}
+    values: dict[int, Information] = {}
+    by_step = sorted(range(len(ledger.sums)), key=ledger.step.__getitem__)
+    for value in by_step:
+        total: Any = 0
+        for atom, times in ledger.sums[value]:
+            if atom not in atoms:
+                kind, step, of = ledger.atoms[atom]
+                make: dict[str, Callable[[], Information]] = {
+                    START: lambda of=of: sources.starts[of],
+                    MEASURED: lambda step=step, of=of: sources.measured(step, of),
+                    PRIOR: lambda step=step, of=of: sources.forward(values[of], step),
+                }
+                atoms[atom] = make[kind]()
+            total = atoms[atom].Y * times + total
+        values[value] = Information(None, total)
+    return [values[value] for value in range(len(ledger.sums))]
+
+
+def _diagonal(A: np.ndarray) -> np.ndarray:
+    return np.diagonal(A, axis1=-2, axis2=-1)
+
+
+def _packed(information: Information) -> np.ndarray:
+    y, Y = information
+    return Y if y is None else np.concatenate([Y, y], axis=-1)
+
+
+def unpacked(packed: np.ndarray, sources: Sources) -> Information:
+    """Return the information pairs that stand side by side in an array."""
+    d = sources.model.dimension
+    return Information(None if sources.records is None else packed[..., d:], packed[..., :d])
+
+
+def check_definite(Y: np.ndarray, step: int, *, rounding: float = 0.0) -> None:
+    """Raise NoAnswerError if an information matrix of a step's stack is not positive definite.
+
+    Of a batch (values, items, d, d) the error names the items.
+
+    Parameters
+    ----------
+    rounding : how negative the smallest eigenvalue, scaled to unit diagonal, may be.
+    """
+    try:
+        fine = bool((Y > 0).all()) if Y.shape[-1] == 1 else np.isfinite(np.linalg.cholesky(Y)).all()
+    except np.linalg.LinAlgError:
+        fine = rounding > 0 and _almost_definite(Y, rounding)
+    if not fine:
+        raise NoAnswerError(
+            f"at step {step} the information claimed in some outcome is not positive definite: what is taken for "
+            "common exceeds what is known, and no covariance follows",
+            _indefinite_items(Y, rounding) if Y.ndim == 4 else (),
+        )
+
+
+def _indefinite_items(Y: np.ndarray, rounding: float) -> list[int]:
+    return np.flatnonzero((_smallest(Y) <= -rounding).any(axis=0)).tolist()
+
+
+def _smallest(Y: np.ndarray) -> np.ndarray:
+    """Smallest eigenvalue of each matrix, scaled to unit diagonal; −∞ where it has none."""
+    diagonal = np.diagonal(Y, axis1=-2, axis2=-1)
+    usable = np.asarray((diagonal > 0).all(axis=-1) & np.isfinite(Y).all(axis=(-2, -1)))
+    scale = 1.0 / np.sqrt(np.where(usable[..., None], diagonal, 1.0))
+    scaled = np.where(usable[..., None, None], Y, 0.0) * scale[..., :, None] * scale[..., None, :]
+    return np.where(usable, np.linalg.eigvalsh(scaled)[..., 0], -np.inf)
+
+
+def _almost_definite(Y: np.ndarray, rounding: float) -> bool:
+    return bool((_smallest(Y) > -rounding).all())

@@ -1,0 +1,343 @@
+"""The world behind the agents' filters: what each filter is told, and how all the noises truly hang together.
+
+Agent i estimates x_i of dimension d_i.  Stacked over the agents, with one matrix for all of them,
+
+    x(k) = diag(F_i) x(k−1) + v(k)      cov v = Q      start: cov = P0
+    z_i(k) = H_i x_i(k) + w_i(k) + δ_i(k)               cov w = [c_ij L_i L_jᵀ],  R_i = L_i L_iᵀ      cov δ ≤ Δ
+
+Agents that track one common state have Q = 1⊗Q (every block is the same noise); agents with states of their own a
+block diagonal one; parallel filters whatever is common to them.  c is 1 on the diagonal.
+
+Errors of linear estimates are carried along as noise footprints, the coefficients of independent unit noises, as
+`stochfuse.estimators.world` does it: a factor of each joint covariance, one agent's rows at a time.  The true
+disturbance is taken to be as large as its bound, white and independent of w.
+
+What a scenario's sources are worth: information for the claimed covariance, noise footprints for the actual error.
+
+The error of every linear estimate obeys the estimate's own equations in a world whose state is zero,
+
+    start        e = Σ L_0 ε            P(k0) = L_0 L_0ᵀ       (and the known initial error b)
+    prediction   e⁻ = F e − L_Q ε       Q = L_Q L_Qᵀ           (the same ε for all agents)
+    measurement  z = C ε                R = C Cᵀ
+
+with independent ε of unit variance.  So the noise footprint of theory section 7, the coefficients of every ε in the
+error, is carried along by the recursion that carries state estimates, with one column for each ε and a last one for b:
+
+    actual covariance = X Xᵀ over the columns X of the noises       bias = the last column
+
+Departure from the source: footprints are kept whitened (in units of each noise's own deviation), which makes the sum
+over sources a product of matrices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from stochfuse.errors import UsageError
+from stochfuse.estimators.ledger import Sources
+from stochfuse.kalman.kernel import Estimate, Information, at_step, factor, to_information
+from stochfuse.kalman.metrics import Moments
+from stochfuse.scenario.model import Filter, Noises
+from stochfuse.scenario.scenario import Scenario
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """What is told and what is true.
+
+    Parameters
+    ----------
+    steps : number of steps.
+    F, H, R : per agent, (d, d), (p, d) and (p, p), each constant or with a leading step axis; p may be 0.
+    Q, P0 : joint process noise (D, D), constant or per step, and joint covariance of the first estimates (D, D).
+    correlation : (n, n) correlation c of the agents' measurement noises, or None if independent.
+    disturbance : (Σp, Σp) bound Δ of the uncertain disturbance, or None.
+    error : (D, 1) known error of the first estimates, or None.
+    own : whether every agent has a state of its own.
+    relations : what agent i measures of agent j, (i, j) → anything with H_i, H_j, R, constant or per step; empty where
+        all track one state.
+    M : shaping x = M_i x_i + s_i of each agent's state into the full one; None where it is the identity.
+    """
+
+    steps: int
+    F: tuple[np.ndarray, ...]
+    H: tuple[np.ndarray, ...]
+    R: tuple[np.ndarray, ...]
+    Q: np.ndarray
+    P0: np.ndarray
+    correlation: np.ndarray | None = None
+    disturbance: np.ndarray | None = None
+    error: np.ndarray | None = None
+    own: bool = False
+    relations: Mapping[tuple[int, int], Any] = field(default_factory=dict)
+    M: tuple[np.ndarray, ...] | None = None
+
+    @property
+    def agents(self) -> int:
+        """Number of agents."""
+        return len(self.F)
+
+    @cached_property
+    def states(self) -> list[slice]:
+        """Where each agent's state is in the stacked one."""
+        return _slices([F.shape[-1] for F in self.F])
+
+    @cached_property
+    def measurements(self) -> list[slice]:
+        """Where each agent's measurement is in the stacked one."""
+        return _slices([H.shape[-2] for H in self.H])
+
+    def joint_noise(self, step: int) -> np.ndarray:
+        """Covariance (Σp, Σp) of all measurement noises w together."""
+        roots = [np.linalg.cholesky(at_step(R, step)) for R in self.R]
+        p = self.measurements[-1].stop
+        out = np.zeros((p, p))
+        for i, (rows, Li) in enumerate(zip(self.measurements, roots, strict=True)):
+            for j, (columns, Lj) in enumerate(zip(self.measurements, roots, strict=True)):
+                c = float(i == j) if self.correlation is None else self.correlation[i, j]
+                if c and Li.size and Lj.size:
+                    out[rows, columns] = c * Li @ Lj.T
+        return out
+
+    def true_noise(self, step: int) -> np.ndarray:
+        """The same with the disturbance."""
+        noise = self.joint_noise(step)
+        return noise if self.disturbance is None else noise + self.disturbance
+
+    def joint_transition(self, step: int) -> np.ndarray:
+        """Transition (D, D) of the stacked state."""
+        out = np.zeros_like(self.P0)
+        for rows, F in zip(self.states, self.F, strict=True):
+            out[rows, rows] = at_step(F, step)
+        return out
+
+    def joint_sensor(self, agent: int, step: int) -> np.ndarray:
+        """What an agent's sensor sees of the stacked state, (p, D)."""
+        H = at_step(self.H[agent], step)
+        out = np.zeros((len(H), len(self.P0)))
+        out[:, self.states[agent]] = H
+        return out
+
+    def between(self, step: int, pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What an agent measures of another, H_i, H_j and R; where all track one state agreement, x_i − x_j = 0."""
+        if self.own:
+            H_i, H_j, R = (at_step(M, step) for M in self.relations[pair])
+            return H_i, H_j, R
+        same = np.eye(self.states[0].stop)
+        return same, -same, 0.0 * same
+
+
+class Footprints:
+    """Noise footprints of a world: columns of unit noises, and a last one for the known initial error."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._start = _root(world.P0)
+        self._process: dict[int, np.ndarray] = {}
+        self._noise: dict[int, np.ndarray] = {}
+        self._relation: dict[tuple[int, int, int], np.ndarray] = {}
+        self._first: dict[Any, int] = {}
+        width = self._start.shape[1]
+        for step in range(2, world.steps + 1):
+            self._process[step], self._noise[step] = _root(at_step(world.Q, step)), _root(world.true_noise(step))
+            self._first["process", step] = width
+            self._first["noise", step] = width = width + self._process[step].shape[1]
+            width += self._noise[step].shape[1]
+        for step in range(1, world.steps + 1):
+            for pair, relation in world.relations.items():
+                self._relation[(step, *pair)] = root = _root(at_step(relation.R, step))
+                self._first["relation", (step, *pair)] = width
+                width += root.shape[1]
+        self.columns = width + 1
+
+    def start(self, rows: slice) -> np.ndarray:
+        """Errors of the first estimates, for some rows of the stacked state."""
+        x = self._placed(self._start[rows], 0)
+        if self._world.error is not None:
+            x[:, -1:] = self._world.error[rows]
+        return x
+
+    def process(self, step: int, rows: slice) -> np.ndarray:
+        """What prediction leaves out, for some rows of the stacked state."""
+        return self._placed(-self._process[step][rows], self._first["process", step])
+
+    def measured(self, step: int, agent: int) -> np.ndarray:
+        """Noise of an agent's measurement."""
+        return self._placed(self._noise[step][self._world.measurements[agent]], self._first["noise", step])
+
+    def related(self, step: int, pair: tuple[int, int]) -> np.ndarray:
+        """Noise of what one agent measures of another; agreement has none."""
+        if not self._world.own:
+            return np.zeros((self._world.states[0].stop, self.columns))
+        return self._placed(self._relation[(step, *pair)], self._first["relation", (step, *pair)])
+
+    def _placed(self, block: np.ndarray, first: int) -> np.ndarray:
+        out = np.zeros((len(block), self.columns))
+        out[:, first : first + block.shape[1]] = block
+        return out
+
+
+def _root(P: np.ndarray) -> np.ndarray:
+    """Factor with as many columns as P has rank."""
+    L = factor(P)
+    return L[:, L.any(axis=0)]
+
+
+def _slices(sizes: list[int]) -> list[slice]:
+    ends = np.cumsum([0, *sizes]).tolist()
+    return [slice(a, b) for a, b in pairwise(ends)]
+
+
+def sources_of(scenario: Scenario, records: np.ndarray | None = None, *, by_agent: bool = False) -> Sources:
+    """Return what start and measurements of every source are worth.
+
+    Parameters
+    ----------
+    records : measurements (steps, agents, p); with them every agent is a source of its own.
+    by_agent : whether that is so anyway; else every kind of sensor is one.
+
+    Raises
+    ------
+    UsageError
+        If the initial covariance has no inverse.
+    """
+    start = _start(scenario, None if records is None else scenario.x0)
+    sensors = scenario.sensors
+    if by_agent or records is not None:
+        sensors = [scenario.sensors[kind] for kind in scenario.sensor_of]
+    columns = None if records is None else [[z[..., None] for z in step] for step in records]
+    return Sources(scenario.model, sensors, [start] * len(sensors), columns)
+
+
+def error_sources(scenario: Scenario, noises: Noises | None = None) -> Sources:
+    """Return the same for every agent, with noise footprints in the place of data; see `moments`.
+
+    Parameters
+    ----------
+    noises : of a batch, P0 among them, in the place of the scenario's.
+
+    Raises
+    ------
+    UsageError
+        If the initial covariance has no inverse.
+    """
+    unit, told = (scenario, scenario) if noises is None else (_unit(scenario, noises), batched(scenario, noises))
+    LQ, LR, LP = _roots(noises)
+    world = world_of(unit)
+    footprints, steps, everyone = Footprints(world), range(2, world.steps + 1), range(world.agents)
+    starts = [_start(told, _in_units(LP, footprints.start(rows))) for rows in world.states]
+    # all agents see one process noise, so that the first agent's rows are everyone's
+    moved = [_in_units(LQ, footprints.process(step, world.states[0])) for step in steps]
+    inputs = np.stack(np.broadcast_arrays(np.zeros((scenario.model.dimension, footprints.columns)), *moved))
+    nothing = [np.zeros((H.shape[-2], footprints.columns)) for H in world.H]
+    measured = ([_in_units(LR, footprints.measured(step, agent)) for agent in everyone] for step in steps)
+    sensors = [told.sensors[kind] for kind in told.sensor_of]
+    return Sources(replace(told.model, Bu=inputs), sensors, starts, [nothing, *measured])
+
+
+def batched(scenario: Scenario, noises: Noises) -> Scenario:
+    """Return the scenario with the noises of a batch in the place of its own: for the numbers only.
+
+    P0 is then of shape (items, d, d) and, where the noises have them, Q of (steps, items, d, d) and R of
+    (steps, items, p, p).
+    """
+    steps, (Q, R, P0) = scenario.network.steps, noises
+    model, sensors = scenario.model, scenario.sensors
+    return replace(
+        scenario,
+        model=model if Q is None else replace(model, Q=np.broadcast_to(Q, (steps, *Q.shape))),
+        sensors=sensors if R is None else tuple(replace(s, R=np.broadcast_to(R, (steps, *R.shape))) for s in sensors),
+        P0=scenario.P0 if P0 is None else P0,
+    )
+
+
+def _unit(scenario: Scenario, noises: Noises) -> Scenario:
+    """Return the scenario with unit noises in the place of a batch's."""
+    units = (None if M is None else np.eye(M.shape[-1]) for M in noises)
+    return batched(scenario, Noises(*units))
+
+
+def _roots(noises: Noises | None) -> tuple[np.ndarray | None, ...]:
+    """Square roots of the noises of a batch, None where there are none."""
+    Q, R, P0 = noises or Noises()
+    # correlations of measurement noises are those of this very root's units, see `World.joint_noise`
+    root = None if R is None else np.linalg.cholesky(R)
+    return None if Q is None else factor(Q), root, None if P0 is None else factor(P0)
+
+
+def _in_units(root: np.ndarray | None, footprint: np.ndarray) -> np.ndarray:
+    """Footprint of unit noises in units of a batch's: (..., rows, columns), the last of them the known error."""
+    if root is None:
+        return footprint
+    noises = root @ footprint[:, :-1]
+    return np.concatenate([noises, np.broadcast_to(footprint[:, -1:], (*noises.shape[:-1], 1))], axis=-1)
+
+
+def world_of(scenario: Scenario) -> World:
+    """Return what the agents' filters are told, and how all noises truly hang together."""
+    n, steps, model = scenario.network.agents, scenario.network.steps, scenario.model
+    sensors = [scenario.sensors[kind] for kind in scenario.sensor_of]
+    filters = scenario.filters or (_filter(scenario),) * n
+    together = np.ones((n, n)) if not scenario.own and not scenario.filters else np.eye(n)
+    shared = np.ones((n, n)) if scenario.correlation == "shared" else np.eye(n)
+    if scenario.filters:
+        Q, P0 = _stacked([f.Q for f in filters], steps), _stacked([f.P0 for f in filters], steps)
+    else:
+        Q, P0 = np.kron(together, model.Q), np.kron(shared, scenario.P0)
+    b = scenario.error
+    return World(
+        steps=steps,
+        F=tuple(f.F for f in filters),
+        H=tuple(s.H for s in sensors),
+        R=tuple(s.R for s in sensors),
+        Q=Q if scenario.process is None else scenario.process,
+        P0=P0,
+        correlation=None if scenario.noise is None else scenario.noise.correlation,
+        disturbance=None if scenario.noise is None else scenario.noise.disturbance,
+        error=None if b is None else np.concatenate([np.linalg.pinv(f.M) @ b for f in filters]),
+        own=scenario.own,
+        relations=scenario.relations,
+        M=tuple(f.M for f in filters) if scenario.filters and not scenario.own else None,
+    )
+
+
+def _filter(scenario: Scenario) -> Filter:
+    d = scenario.model.dimension
+    return Filter(scenario.model.F, scenario.model.Q, scenario.P0, np.eye(d), np.zeros((d, 1)))
+
+
+def _stacked(blocks: Sequence[np.ndarray], steps: int) -> np.ndarray:
+    """Block diagonal matrix, per step where one of the blocks is."""
+    from scipy.linalg import block_diag
+
+    if any(block.ndim > 2 for block in blocks):
+        return np.array([block_diag(*(at_step(block, step) for block in blocks)) for step in range(1, steps + 1)])
+    return np.asarray(block_diag(*blocks))
+
+
+def moments(estimate: Estimate | Moments) -> Moments:
+    """Moments of the error from an estimate whose state is a noise footprint, x of shape (..., d, columns)."""
+    if isinstance(estimate, Moments):
+        return estimate
+    return Moments.of_footprint(estimate.P, estimate.x)
+
+
+def claimed_only(estimate: Estimate | Moments) -> Moments:
+    """Moments of an estimate whose error is not asked for."""
+    return Moments(estimate.P)
+
+
+def _start(scenario: Scenario, x: np.ndarray | None) -> Information:
+    try:
+        start = to_information(Estimate(x, scenario.P0))
+    except np.linalg.LinAlgError:
+        start = None
+    if start is None or not np.isfinite(start.Y).all():
+        raise UsageError("initial.P: expected an invertible covariance for the Local Fusion Graph, got a singular one")
+    return start

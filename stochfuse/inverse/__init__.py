@@ -1,1 +1,0 @@
-"""Questions asked backwards: which link probability, which link, how many agents."""

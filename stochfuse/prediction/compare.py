@@ -1,0 +1,198 @@
+"""Methods side by side, and estimators side by side: the same scenario, several answers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import log2
+from typing import Any
+
+import numpy as np
+
+from stochfuse.engines.enumeration import TooManyError
+from stochfuse.engines.events import events
+from stochfuse.errors import NoAnswerError, UsageError
+from stochfuse.kalman.metrics import Metric
+from stochfuse.prediction.predict import ESTIMATORS, METHODS, choose, predict
+from stochfuse.prediction.quantities import QUANTITIES
+from stochfuse.prediction.result import Prediction
+from stochfuse.scenario.scenario import Scenario, link_rows
+
+DEFAULT_METHODS = ("general", "simplified", "naive", "monte-carlo")
+EXACT_FIRST = ("general", "optimal", "simplified", "naive", "monte-carlo")
+"""Which method the others are compared with, if it is not said."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Predictions of several methods.
+
+    Parameters
+    ----------
+    predictions : one per method, the reference first.
+    """
+
+    predictions: tuple[Prediction, ...]
+
+    @property
+    def reference(self) -> Prediction:
+        """Return what the others are compared with."""
+        return self.predictions[0]
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Names of the methods, the reference first."""
+        return tuple(p.method for p in self.predictions)
+
+    def values(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray:
+        """Return a metric, shape (methods, links, steps)."""
+        return np.stack([p.values(of, agent) for p in self.predictions])
+
+    def differences(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray:
+        """Return each method's metric less the reference's, shape (methods, links, steps)."""
+        values = self.values(of, agent)
+        return values - values[0]
+
+
+def compare(
+    scenario: Scenario,
+    link: Sequence[float] | np.ndarray | float | None = None,
+    methods: Sequence[str] = DEFAULT_METHODS,
+    reference: str | None = None,
+    quantity: str = "claimed",
+    **settings: Any,
+) -> Comparison:
+    """Predict by several methods.
+
+    Parameters
+    ----------
+    scenario, link : as for `predict`.
+    methods : at least one of `METHODS`.
+    reference : the method that the others are compared with; default: general if it is among them, else the most exact.
+    quantity : what is compared, as for `predict`.
+    **settings : as for `predict`.
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    UsageError
+        If a method is unknown or named twice, or the request does not fit the scenario.
+    """
+    if not methods:
+        raise UsageError(f"methods: expected at least one of {', '.join(METHODS)}, got none")
+    for method in methods:
+        choose("methods", method, METHODS)
+    if len(set(methods)) < len(methods):
+        raise UsageError(f"methods: expected different ones, got {', '.join(methods)}")
+    if quantity == "optimal" and len(methods) > 1:
+        raise UsageError("quantity: expected one that depends on the method; the optimum is the same for all")
+    if reference is None:
+        reference = min(methods, key=EXACT_FIRST.index)
+    elif reference not in methods:
+        raise UsageError(f"reference: expected one of the methods compared ({', '.join(methods)}), got '{reference}'")
+    ordered = [reference, *(m for m in methods if m != reference)]
+    settings = {"quantity": quantity, **settings}
+    return Comparison(tuple(_predict(scenario, link, method, settings) for method in ordered))
+
+
+def _predict(scenario: Scenario, link: Any, method: str, settings: dict[str, Any]) -> Prediction:
+    try:
+        return predict(scenario, link, method, **settings)
+    except UsageError as error:
+        raise UsageError(f"{method} cannot be compared here, leave it out of the methods: {error}") from None
+
+
+EASY, EASY_EXCHANGE = 2000, 12
+"""Graphs, and binary logarithm of the outcomes of one exchange, up to which outcomes are enumerated unasked."""
+SIDE_BY_SIDE = ("claimed", "actual", "consistency")
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatorComparison:
+    """What several estimators claim and achieve in one scenario.
+
+    Parameters
+    ----------
+    predictions : one per estimator, each with the moments of its actual error.
+    left_out : estimators that were not asked for by name and cannot be had here, with the reason.
+    """
+
+    predictions: tuple[Prediction, ...]
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def estimators(self) -> tuple[str, ...]:
+        """Names of the estimators."""
+        return tuple(p.estimator for p in self.predictions)
+
+    def values(self, quantity: str, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray:
+        """Return a quantity's metric, shape (estimators, links, steps)."""
+        return np.stack([p.shown_as(quantity).values(of, agent) for p in self.predictions])
+
+
+def compare_estimators(
+    scenario: Scenario,
+    link: Sequence[float] | np.ndarray | float | None = None,
+    estimators: Sequence[str] | None = None,
+    method: str | None = None,
+    *,
+    quantities: Sequence[str] = SIDE_BY_SIDE,
+    **settings: Any,
+) -> EstimatorComparison:
+    """Predict what several estimators claim and what their errors truly are, on the same lossy network.
+
+    Parameters
+    ----------
+    scenario, link : as for `predict`.
+    estimators : names out of `stochfuse.prediction.predict.ESTIMATORS`; default: all that the scenario takes.
+    method : "general" or "monte-carlo"; default: exact where up to `EASY` graphs (or `max_graphs`) have to be carried
+        and no runs are asked for, else sampled, with the same arrivals for all estimators.
+    quantities : what is to be compared; bias and rms make a note of an initial error that is not known.
+    **settings : as for `predict`.
+
+    Raises
+    ------
+    UsageError
+        If an estimator is unknown, named twice, or cannot be had for the scenario; or if none can.
+    """
+    for name in estimators or ():
+        choose("estimator", name, ESTIMATORS)
+    if len(set(estimators or ())) < len(estimators or ()):
+        raise UsageError(f"estimator: expected different ones, got {', '.join(estimators or ())}")
+    if method is not None:
+        choose("methods", method, ("general", "monte-carlo"))
+    for quantity in quantities:
+        choose("quantity", quantity, tuple(q for q in QUANTITIES if q != "optimal"))
+    hardest = max(quantities, key=("claimed", "actual", "consistency", "bias", "rms").index)
+    found: list[Prediction] = []
+    left_out: dict[str, list[str]] = {}
+    for name in estimators or ESTIMATORS:
+        try:
+            found.append(_estimated(scenario, link, name, method, hardest, settings).shown_as(quantities[0]))
+        except (UsageError, NoAnswerError) as error:
+            reason = str(error).removeprefix(f"estimator {name}: ")
+            if estimators:
+                raise type(error)(f"estimator {name}: {reason}") from None
+            left_out.setdefault(reason, []).append(name)
+    if not found:
+        raise UsageError("no estimator can be had here:\n  " + "\n  ".join(left_out))
+    return EstimatorComparison(tuple(found), tuple(f"{', '.join(n)}: {reason}" for reason, n in left_out.items()))
+
+
+def _estimated(
+    scenario: Scenario, link: Any, estimator: str, method: str | None, quantity: str, settings: dict[str, Any]
+) -> Prediction:
+    if method is not None:
+        return predict(scenario, link, method, quantity, estimator=estimator, **settings)
+    easy = {"max_graphs": EASY, **settings, "progress": None}
+    network = scenario.network
+    exchange = len(events(network, link_rows(scenario, link), 1)) * log2(len(network.delay) + 1)
+    if {"runs", "seed", "workers"} & set(settings) or exchange > EASY_EXCHANGE:
+        return predict(scenario, link, "monte-carlo", quantity, estimator=estimator, **settings)
+    try:
+        return predict(scenario, link, "general", quantity, estimator=estimator, **easy)
+    except TooManyError:
+        return predict(scenario, link, "monte-carlo", quantity, estimator=estimator, **settings)

@@ -1,0 +1,198 @@
+"""A prediction: plain arrays with named axes, and what they mean."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from stochfuse.errors import UsageError
+from stochfuse.kalman.metrics import Metric, Moments, metric
+from stochfuse.prediction.quantities import linear, matrix, number, value
+from stochfuse.scenario.scenario import Scenario
+
+if TYPE_CHECKING:
+    from stochfuse.prediction.general import Outcomes
+    from stochfuse.prediction.sampled import Sampled
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Expected covariance, or another quantity of the error, against link probability and step.
+
+    Parameters
+    ----------
+    scenario : what was given.
+    method : how it was computed: "simplified", "general", "naive", "optimal" or "monte-carlo".
+    quantity : what is shown, one of `stochfuse.prediction.quantities.QUANTITIES`.
+    stage : "posterior": after the step's measurement and fusion.
+    nature : "exact", "approximate", "bound" or "sampled".
+    link : (links,) link probability of each row, averaged over the links if they differ.
+    cases : a name per row where the rows are cases, else None.
+    steps : (steps,) step numbers, from 1.
+    moments : moments of the error, (links, steps, groups, …), per group of agents that are alike.
+    group_of : (agents,) index into the groups.
+    forms : numeric forms used.
+    notes : what the reader should know, one sentence each.
+    estimator : what the agents do with what arrives.
+    outcomes : all outcomes, where they were enumerated: for distributions and polynomials.
+    sampled : the sample, where it was drawn: for standard errors.
+    meta : further facts for programs.
+    steady : (links, groups, d, d) steady-state covariance if it was asked for.
+    steady_bound : (links, groups) proved relative error bound of `steady`.
+    """
+
+    scenario: Scenario
+    method: str
+    quantity: str
+    stage: str
+    nature: str
+    link: np.ndarray
+    cases: tuple[str, ...] | None
+    steps: np.ndarray
+    moments: Moments
+    group_of: np.ndarray
+    forms: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    estimator: str = "broadcast-prior"
+    outcomes: Outcomes | None = field(default=None, repr=False)
+    sampled: Sampled | None = field(default=None, repr=False)
+    meta: Mapping[str, Any] = field(default_factory=dict)
+    steady: np.ndarray | None = None
+    steady_bound: np.ndarray | None = field(default=None, repr=False)
+
+    @property
+    def by_group(self) -> np.ndarray:
+        """Covariance per group of agents, shape (links, steps, groups, d, d).
+
+        Of consistency it is the actual covariance, of rms the mean squared error, of bias the vector (…, d, 1).
+        """
+        return matrix(self.quantity, self.moments)
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """The same averaged over the agents, shape (links, steps, d, d)."""
+        return self.of_agent("mean")
+
+    @property
+    def alike(self) -> bool:
+        """Whether all agents have the same covariance."""
+        return self.by_group.shape[2] == 1
+
+    def of_agent(self, agent: int | str = "mean") -> np.ndarray:
+        """The same of one agent (numbered from 1) or averaged over all, shape (links, steps, d, d)."""
+        return self._select(self.by_group, agent)
+
+    def shown_as(self, quantity: str) -> Prediction:
+        """Return the same prediction with another quantity of those that were computed.
+
+        Raises
+        ------
+        UsageError
+            If it was not computed.
+        """
+        if matrix(quantity, self.moments) is None:
+            raise UsageError(f"quantity {quantity}: was not computed; predict it with quantity='{quantity}'")
+        return replace(self, quantity=quantity)
+
+    def values(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray:
+        """Return a metric of the covariance (or what the quantity makes of it), shape (links, steps).
+
+        Parameters
+        ----------
+        of : a `stochfuse.kalman.metrics.Metric` or its name.
+        agent : "mean" (of the covariance averaged over the agents), a number from 1, or "worst" or "best" (the largest
+            or smallest value among the agents, for each link and step).
+        """
+        return self._reduce(self.moments, of, agent)
+
+    def statistic(self, name: str, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray:
+        """Return a statistic of a metric over the outcomes, shape (links, steps).
+
+        Parameters
+        ----------
+        name : "mean", "variance", "std", "quantile:P", "at-most:LIMIT" (the probability that the metric is at most
+            that) or "derivative" (of the expected metric in the link probability).
+        of : the metric; except for "mean", of the covariance in each outcome.
+        agent : as in `values`; "mean" is an agent picked at random.
+
+        Raises
+        ------
+        UsageError
+            If the outcomes were not enumerated, or there is no such statistic of the metric.
+        """
+        if name == "mean":
+            return self.values(of, agent)
+        if self.outcomes is None:
+            raise UsageError(f"statistic '{name}': expected method general or naive, got {self.method}")
+        m = metric(of, self.scenario.model) if isinstance(of, str) else of
+        everyone = list(range(self.by_group.shape[2]))
+        if agent in ("worst", "best"):
+            each = np.stack([self.outcomes.statistic(name, m, [g], self.quantity) for g in everyone])
+            return each.max(axis=0) if agent == "worst" else each.min(axis=0)
+        chosen = everyone if agent == "mean" else [self._group(agent)]
+        return self.outcomes.statistic(name, m, chosen, self.quantity)
+
+    def polynomials(self, of: Metric, agent: int | str = "mean") -> list[np.ndarray] | None:
+        """Return A_0 … A_L per step of a linear metric's polynomial Σ A_c µ^c (1−µ)^(L−c); None if there is none."""
+        if self.outcomes is None or not self.outcomes.polynomial or agent in ("worst", "best"):
+            return None
+        if not linear(self.quantity, of):
+            return None
+        groups = range(self.by_group.shape[2]) if agent == "mean" else [self._group(agent)]
+        share = [(self.group_of == g).sum() for g in groups]
+        by_step = []
+        for k in self.steps:
+            each = [self.outcomes.coefficients(int(k), g, self.quantity) for g in groups]
+            by_step.append(number(self.quantity, of, np.average(each, axis=0, weights=share)))
+        return by_step
+
+    def standard_error(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray | None:
+        """Return the standard error of `values`, shape (links, steps), or None if nothing was sampled."""
+        if self.sampled is None:
+            return None
+        m = metric(of, self.scenario.model) if isinstance(of, str) else of
+        groups = self.sampled.groups
+        if agent in ("worst", "best"):
+            each = np.stack([self.sampled.standard_error(m, group, self.quantity) for group in groups])
+            values = value(self.quantity, m, self.moments)
+            chosen = values.argmax(axis=-1) if agent == "worst" else values.argmin(axis=-1)
+            return np.take_along_axis(each, chosen[None], axis=0)[0]
+        whom = sum(groups, ()) if agent == "mean" else groups[self._group(agent)]
+        return self.sampled.standard_error(m, whom, self.quantity)
+
+    def _group(self, agent: int | str) -> int:
+        if isinstance(agent, int | np.integer) and 1 <= agent <= len(self.group_of):
+            return int(self.group_of[agent - 1])
+        raise UsageError(f"agent: expected mean, worst, best or a number from 1 to {len(self.group_of)}, got '{agent}'")
+
+    def steady_values(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray | None:
+        """Return a metric of the steady state, shape (links,), or None if none was computed."""
+        return None if self.steady is None else self._reduce(Moments(self.steady), of, agent)
+
+    def table(self, of: str = "trace", agent: int | str = "mean") -> str:
+        """Return the table as text, as `stochfuse predict` prints it."""
+        from stochfuse.report.predictions import View, predict_table
+        from stochfuse.report.table import to_text
+
+        return to_text(predict_table(View(self, metric(of, self.scenario.model), agent)), width=None)
+
+    def with_steady(self, P: np.ndarray, bound: np.ndarray) -> Prediction:
+        """Return the same with its steady state."""
+        return replace(self, steady=P, steady_bound=bound)
+
+    def _reduce(self, moments: Moments, of: str | Metric, agent: int | str) -> np.ndarray:
+        m = metric(of, self.scenario.model) if isinstance(of, str) else of
+        with np.errstate(over="ignore", invalid="ignore"):
+            if agent in ("worst", "best"):
+                each = value(self.quantity, m, moments)
+                return each.max(axis=-1) if agent == "worst" else each.min(axis=-1)
+            return value(self.quantity, m, moments.map(lambda M: self._select(M, agent)))
+
+    def _select(self, M: np.ndarray, agent: int | str) -> np.ndarray:
+        if agent != "mean":
+            return M[..., self._group(agent), :, :]
+        share = np.bincount(self.group_of, minlength=M.shape[-3]) / len(self.group_of)
+        return M[..., 0, :, :] if M.shape[-3] == 1 else np.tensordot(M, share, axes=(M.ndim - 3, 0))

@@ -1,0 +1,334 @@
+"""The simplified stochastic formulation, thesis (50)–(54).
+
+For like agents that are heard with equal probability, m of the N = n − 1 possible messages arrive with
+β(m) = C(N, m) µ^m (1−µ)^(N−m), (50), and
+
+    (54)  P(k) = Σ β(m) P_m,    P_m = [(m+1) P⁻¹(k|k) − m P⁻¹(k|k−1)]⁻¹
+    (53)  x̂(k) = Σ β(m) P_m [(m+1) P⁻¹(k|k) x̂(k|k) − m P⁻¹(k|k−1) x̂(k|k−1)]
+
+where P(k|k−1) is predicted from the *averaged* P(k−1).  Since P⁻¹(k|k) = P⁻¹(k|k−1) + HᵀR⁻¹H,
+
+    P_m = update(P(k|k−1), R/(m+1)):
+
+m arrivals make one Kalman update with m + 1 measurements.  `outcome` is that form, `outcome_as_printed` the literal
+one; the symbolic tests prove them equal.  At step 1 independent initial estimates share nothing, and P_m = P(k0)/(m+1);
+a shared initial estimate stays what it is.
+
+Departures from the source
+--------------------------
+* Erratum 1: (53) prints P(k) in front of the sum; by (48) P_m belongs inside.  As printed the estimate is biased by
+  E[P_m] E[P_m⁻¹] ≥ 1.  `stochfuse.prediction.states` evaluates both.
+* Erratum 2: (52) counts m − 1 common terms because its m counts all sets; (53)/(54) count received sets.
+* Unequal links µ_ij(k): the number of arrivals is Poisson-binomial.  Unlike agents: agent i averages over the sets S of
+  senders, P_S⁻¹ = P_i⁻¹(k|k−1) + J_i + Σ_{j∈S} J_j, summed here by how many of each kind of sensor arrive.
+* Cyclic and masked networks: the same recursion with the true number of possible senders, an approximation outside the
+  derivation (`departures` says so).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from stochfuse.engines.mean_field import COMMON, Case, Outcomes, run, run_like
+from stochfuse.errors import StochfuseError, UsageError
+from stochfuse.kalman.algebra import NUMPY, Algebra, inverse
+from stochfuse.kalman.arrivals import Counts, like_senders, poisson_binomial
+from stochfuse.kalman.averaged_update import sound
+from stochfuse.kalman.checks import first_fault
+from stochfuse.kalman.kernel import Estimate, from_information, to_information, update, update_information
+from stochfuse.scenario.model import Noises
+from stochfuse.scenario.network import LinkRows, Network, number_of_senders, possible_senders, require_memoryless
+from stochfuse.scenario.scenario import Scenario, require_independent_noise, require_one_state
+
+MOST_OUTCOMES = 100_000
+"""Sets of senders (counted by kind of sensor) beyond which unlike agents are refused."""
+
+
+def outcome(prior: Estimate, H: Any, R: Any, m: int, z: Any = None, *, algebra: Algebra = NUMPY) -> Estimate:
+    """P_m and x̂_m as one update with m + 1 measurements: the identity behind (53)/(54), in any algebra."""
+    return update(prior, H, R / (m + 1), z, algebra=algebra)
+
+
+def outcome_by_information(prior: Estimate, H: Any, R: Any, m: int, *, algebra: Algebra = NUMPY) -> Estimate:
+    """P_m in information form, [P⁻¹(k|k−1) + (m+1) HᵀR⁻¹H]⁻¹, the shortest for symbols; needs an invertible prior."""
+    information = update_information(to_information(prior, algebra=algebra), H, R / (m + 1), algebra=algebra)
+    return from_information(information, algebra=algebra)
+
+
+def outcome_as_printed(prior: Estimate, H: Any, R: Any, m: int, z: Any = None, *, algebra: Algebra = NUMPY) -> Estimate:
+    """P_m and x̂_m as (53)/(54) print them; the prior must be invertible."""
+    before = to_information(prior, algebra=algebra)
+    local = to_information(update(prior, H, R, z, algebra=algebra), algebra=algebra)
+    P = algebra.symmetric(inverse((m + 1) * local.Y - m * before.Y, algebra))
+    if prior.x is None:
+        return Estimate(None, P)
+    return Estimate(P @ ((m + 1) * local.y - m * before.y), P)
+
+
+def average(outcomes: Sequence[Estimate], weights: Sequence[Any]) -> Estimate:
+    """Σ β(m)·(x̂_m, P_m): the expectation in (53)/(54), with P_m inside the sum."""
+    P = _weighted([o.P for o in outcomes], weights)
+    return Estimate(None if outcomes[0].x is None else _weighted([o.x for o in outcomes], weights), P)
+
+
+def _weighted(matrices: Sequence[Any], weights: Sequence[Any]) -> Any:
+    # matrix first: an exact scalar does not know how to multiply an array, an array knows both ways
+    terms = [A * w for A, w in zip(matrices, weights, strict=True)]
+    return sum(terms[1:], terms[0])
+
+
+class Group(NamedTuple):
+    """Agents whose covariances are equal, and how the engine carries them.
+
+    Parameters
+    ----------
+    agents : numbers of the agents, from 0, per column of the group.
+    case : `Case` for like agents, `Outcomes` for unlike ones.
+    """
+
+    agents: tuple[tuple[int, ...], ...]
+    case: Case | Outcomes
+
+    @property
+    def columns(self) -> int:
+        """Number of distinct receivers."""
+        return len(self.agents)
+
+
+class Covariances(NamedTuple):
+    """Averaged posterior covariances.
+
+    Parameters
+    ----------
+    P : (links, steps, groups, d, d).
+    group_of : index into the groups for every agent, shape (agents,).
+    forms : which numeric forms were used.
+    """
+
+    P: np.ndarray
+    group_of: np.ndarray
+    forms: tuple[str, ...]
+
+
+def covariances(scenario: Scenario, rows: LinkRows) -> Covariances:
+    """Evaluate (54) for every row of link probabilities and every step.
+
+    Raises
+    ------
+    UsageError
+        If messages are delayed, unlike agents make too many outcomes, or agents do not track one state with independent
+        noises.
+    StochfuseError
+        If a covariance grows beyond floating point.
+    """
+    require_one_state(scenario, "method simplified")
+    require_independent_noise(scenario, "method simplified")
+    steps, links = scenario.network.steps, len(rows.link)
+    parts, forms, all_groups = [], set(), groups(scenario, rows)
+    for group in all_groups:
+        if isinstance(group.case, Case):
+            P, cancelled = run_like(group.case, steps)
+            forms |= forms_used(cancelled)
+        else:
+            P = np.empty((steps, *scenario.P0.shape, group.case.items))
+            with np.errstate(all="ignore"):
+                run(group.case, steps, P)
+            forms.add("outcomes")
+        if not np.isfinite(P).all():
+            item, why = min(faults(P).items())
+            µ = rows.means(scenario.network)[item // group.columns]
+            raise StochfuseError(f"method simplified: {why} (link probability {µ:g})")
+        d = P.shape[1]
+        parts.append(P.reshape(steps, d, d, links, group.columns).transpose(3, 0, 4, 1, 2))
+    P = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=2)
+    return Covariances(P, index_of_groups(all_groups, scenario.network.agents), tuple(sorted(forms)))
+
+
+def forms_used(cancelled: np.ndarray) -> set[str]:
+    """Return the numeric forms of like agents, from whether each item needed the square-root form."""
+    used = {"square-root"} if cancelled.any() else set()
+    return used | ({"measurement-space"} if not cancelled.all() else set())
+
+
+def faults(P: np.ndarray) -> dict[int, str]:
+    """Why covariances (steps, d, d, items) are none, per item where one is not: the first step and what is wrong."""
+    # what is not finite stays so; what an update takes too much of shows in a variance, or is there at the last step
+    fine = sound(P[-1]) & (np.diagonal(P, axis1=1, axis2=2) >= 0).all(axis=(0, 2))
+    found: dict[int, str] = {}
+    for item in np.flatnonzero(~fine):
+        first = first_fault(P[..., item])
+        if first is not None:
+            step, fault = first
+            lost = f"the covariance at step {step} is not finite: it grows beyond floating point"
+            fine_at = np.isfinite(P[step - 1, ..., item]).all()
+            found[int(item)] = f"expected a covariance at step {step}, got {fault}" if fine_at else lost
+    return found
+
+
+def index_of_groups(all_groups: Sequence[Group], agents: int) -> np.ndarray:
+    """Index of every agent's column among the columns of all groups, shape (agents,)."""
+    index = np.zeros(agents, dtype=int)
+    for column, members in enumerate(members for group in all_groups for members in group.agents):
+        index[list(members)] = column
+    return index
+
+
+def reach_of_rounding(scenario: Scenario, rows: LinkRows) -> np.ndarray:
+    """Relative error that rounding may cause in the covariance of like agents at some step, for every row of links.
+
+    At three or four times the cost of the square-root form; see `stochfuse.engines.precision`.  Zeros for unlike
+    agents, for whom it is not known.
+    """
+    from stochfuse.engines.precision import rounding
+
+    reach = np.zeros(len(rows.link))
+    for group in groups(scenario, rows):
+        if isinstance(group.case, Case):
+            of_items = rounding(group.case, run_like(group.case, scenario.network.steps)[0])
+            reach = np.maximum(reach, of_items.reshape(len(rows.link), -1).max(axis=1))
+    return reach
+
+
+def departures(scenario: Scenario, rows: LinkRows) -> list[str]:
+    """Return what of a scenario lies outside the derivation of (54), one sentence each."""
+    network = scenario.network
+    notes = []
+    if network.architecture == "cyclic" and network.agents > 2:
+        notes.append(
+            "(54) is derived for ad hoc and broadcast networks; on a cyclic one it is an approximation outside its "
+            "derivation, evaluated with the one possible sender of each agent"
+        )
+    if not rows.uniform:
+        steps = range(1, network.steps + 1 if rows.varies else 2)
+        if any(((m := rows.matrices(network, k)) == 0).any() and (m > 0).any() for k in steps):
+            notes.append(
+                "some links have probability 0: on a masked network (54) is an approximation outside its derivation, "
+                "evaluated with the possible senders of each agent"
+            )
+    return notes
+
+
+def require_prompt(network: Network) -> None:
+    """Raise UsageError if messages may be delayed."""
+    if network.delay[0] != 1.0:
+        raise UsageError("method 'simplified' is derived without delay (thesis 4.2); network.delay must be 0")
+
+
+def groups(scenario: Scenario, rows: LinkRows) -> list[Group]:
+    """Return the groups of agents that (54) has to be evaluated for."""
+    network = scenario.network
+    require_prompt(network)
+    steps = range(1, network.steps + 1)
+    require_memoryless(
+        rows,
+        "method 'simplified'",
+        "it averages after every step and forgets which links were bad; use general, optimal or monte-carlo",
+    )
+    shared = scenario.correlation == "shared"
+    if len(scenario.sensors) == 1 and rows.uniform:
+        return [Group((tuple(range(network.agents)),), like_case(scenario, rows))]
+    matrices = dict(zip(steps, _per_step(rows, network.steps, lambda k: rows.matrices(network, k)), strict=True))
+    kinds = np.asarray(scenario.sensor_of)
+    senders_of = possible_senders(network.architecture, network.agents)
+    return [
+        _group(scenario, shared, np.flatnonzero(kinds == own), own, kinds[senders_of], matrices)
+        for own in range(len(scenario.sensors))
+    ]
+
+
+def like_case(scenario: Scenario, rows: LinkRows, noises: Noises = COMMON) -> Case:
+    """Like agents with equally likely links, and the noises of each row's own where there are any."""
+    network = scenario.network
+    senders = number_of_senders(network.architecture, network.agents)
+    arrivals = _per_step(rows, network.steps, lambda k: like_senders(senders, rows.at_step(k)))
+    shared = scenario.correlation == "shared"
+    return Case(scenario.model, scenario.sensors[0], scenario.P0, shared, arrivals, len(rows.link), noises)
+
+
+def _group(
+    scenario: Scenario,
+    shared: bool,
+    agents: np.ndarray,
+    own: int,
+    sender_kinds: np.ndarray,
+    matrices: dict[int, np.ndarray],
+) -> Group:
+    """Agents with one kind of sensor, those that hear others with the same probabilities taken together."""
+    kinds_here = sender_kinds[agents]
+    order = np.argsort(kinds_here, axis=1, kind="stable")
+    kinds_here = np.take_along_axis(kinds_here, order, axis=1)
+    by_step, seen = [], {}
+    for matrix in matrices.values():
+        if id(matrix) not in seen:
+            heard = np.take_along_axis(matrix[:, agents], order[None], axis=2)
+            for kind in np.unique(kinds_here):
+                # like senders are interchangeable: sort their probabilities, so that equal receivers look equal
+                heard = _sort_within(heard, kinds_here == kind)
+            seen[id(matrix)] = heard
+        by_step.append(seen[id(matrix)])
+    signature = np.concatenate(
+        [kinds_here, *(h.transpose(1, 0, 2).reshape(len(agents), -1) for h in seen.values())], axis=1
+    )
+    _, first, column_of = np.unique(signature, axis=0, return_index=True, return_inverse=True)
+    members = tuple(tuple(agents[column_of.ravel() == c].tolist()) for c in range(len(first)))
+    if len(scenario.sensors) == 1:
+        tables = {id(h): Counts(_items(poisson_binomial(np.moveaxis(h[:, first], -1, 0)))) for h in by_step}
+        arrivals = [tables[id(h)] for h in by_step]
+        items = by_step[0].shape[0] * len(first)
+        return Group(members, Case(scenario.model, scenario.sensors[0], scenario.P0, shared, arrivals, items))
+    return Group(members, _outcomes(scenario, shared, own, kinds_here[first], [h[:, first] for h in by_step]))
+
+
+def _sort_within(heard: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    filled = np.where(mask, heard, np.inf)
+    ranks = np.sort(filled, axis=-1)
+    places = np.cumsum(mask, axis=-1) - 1
+    return np.where(
+        mask, np.take_along_axis(ranks, np.broadcast_to(np.maximum(places, 0), heard.shape), axis=-1), heard
+    )
+
+
+def _items(table: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(table.reshape(len(table), -1))
+
+
+def _outcomes(
+    scenario: Scenario, shared: bool, own: int, sender_kinds: np.ndarray, heard: list[np.ndarray]
+) -> Outcomes:
+    """Every count of arrivals per kind of sensor; receivers of one kind may hear different numbers of each."""
+    kinds = range(len(scenario.sensors))
+    most = [int((sender_kinds == kind).sum(axis=1).max()) if sender_kinds.size else 0 for kind in kinds]
+    number = int(np.prod([n + 1.0 for n in most]))
+    if number > MOST_OUTCOMES:
+        raise UsageError(
+            f"unlike agents make {number} sets of senders to average over (at most {MOST_OUTCOMES} are evaluated); "
+            "give fewer kinds of sensors"
+        )
+    counts = np.array(list(product(*(range(n + 1) for n in most))))
+    weights, seen = [], {}
+    for h in heard:
+        if id(h) not in seen:
+            seen[id(h)] = _outcome_weights(h, sender_kinds, counts, kinds)
+        weights.append(seen[id(h)])
+    own_measurement = np.eye(len(kinds), dtype=int)[own]
+    return Outcomes(scenario.model, scenario.sensors, scenario.P0, shared, counts + own_measurement, weights)
+
+
+def _outcome_weights(heard: np.ndarray, sender_kinds: np.ndarray, counts: np.ndarray, kinds: range) -> np.ndarray:
+    weights = np.ones((len(counts), *heard.shape[:2]))
+    for kind in kinds:
+        # a link to a sender of another kind cannot deliver this kind: probability 0 leaves its count as it is
+        pmf = poisson_binomial(np.moveaxis(np.where(sender_kinds == kind, heard, 0.0), -1, 0))
+        weights *= pmf[counts[:, kind]]
+    return _items(weights)
+
+
+def _per_step(rows: LinkRows, steps: int, make: Any) -> list[Any]:
+    """One object per step, and the same object at every step where the links do not vary."""
+    if not rows.varies:
+        return [make(1)] * steps
+    return [make(step) for step in range(1, steps + 1)]

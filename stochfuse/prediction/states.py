@@ -1,0 +1,229 @@
+"""Expected state estimates for a given measurement record, thesis (53).
+
+With P_m one update with m + 1 measurements, the consistent (53) is
+
+    x̂(k) = x̂⁻ + K̄ (z − H x̂⁻),    K̄ = Σ β(m) K_m,   K_m = P⁻Hᵀ(H P⁻Hᵀ + R/(m+1))⁻¹
+
+for one record z(k) that stands for what every agent measured, as (53) has it.  Agents with records of their own average
+over the sets S of senders, x̂_i(k) = Σ_S µ_S µ_¬S update(prior_i; z_i and z_j, j ∈ S), with agent i's prior in the place
+of the common one.  The printed (53) puts the averaged P(k) in front of the sum; its bias is erratum 1 (see
+`stochfuse.prediction.simplified`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import chain, combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from stochfuse.engines.mean_field import Case
+from stochfuse.errors import UsageError
+from stochfuse.kalman.arrivals import Arrivals
+from stochfuse.kalman.kernel import (
+    Estimate,
+    at_step,
+    factor,
+    posterior_gain,
+    predict,
+    to_information,
+    update,
+    update_factor,
+)
+from stochfuse.prediction import simplified
+from stochfuse.scenario.model import Sensor
+from stochfuse.scenario.network import LinkRows, possible_senders
+from stochfuse.scenario.scenario import Scenario, link_rows
+
+MOST_AGENTS = 12
+"""Agents up to which records of their own are averaged over all sets of senders."""
+
+
+class States(NamedTuple):
+    """Expected posterior state estimates.
+
+    Parameters
+    ----------
+    link : (links,) mean link probability of each row.
+    steps : (steps,) step numbers.
+    x : (links, steps, agents, d) expected estimate of every agent, in the units of the model.
+    names : names of the d states.
+    """
+
+    link: np.ndarray
+    steps: np.ndarray
+    x: np.ndarray
+    names: tuple[str, ...]
+
+
+def predict_states(
+    scenario: Scenario, measurements: Any, link: Sequence[float] | None = None, *, printed: bool = False
+) -> States:
+    """Expected state estimates of the simplified formulation for a record of measurements, thesis (53).
+
+    Parameters
+    ----------
+    scenario : the scenario; its initial.x is the estimate at step 1.
+    measurements : (steps, p): one record that stands for every agent's; or (steps, agents, p): each agent's own, for at
+        most 12 agents.  The entry of step 1 is not used: nothing is measured before the first exchange.
+    link : link probabilities, one row each; default: those of the scenario.
+    printed : evaluate (53) as the thesis prints it, with P(k) in front of the sum (one record only).
+
+    Returns
+    -------
+    States
+
+    Raises
+    ------
+    UsageError
+        If the record does not fit the scenario.
+    """
+    rows = link_rows(scenario, link)
+    z = np.asarray(measurements, dtype=float)
+    steps, n = scenario.network.steps, scenario.network.agents
+    widths = {sensor.H.shape[-2] for sensor in scenario.sensors}
+    expected = (
+        f"(steps, p) or (steps, agents, p) with {steps} steps, {n} agents and p = {', '.join(map(str, sorted(widths)))}"
+    )
+    if len(widths) > 1 or z.ndim not in (2, 3) or len(z) < steps or z.shape[-1] not in widths:
+        raise UsageError(f"measurements: expected shape {expected}, got {z.shape}")
+    if z.ndim == 3 and z.shape[1] != n:
+        raise UsageError(f"measurements: expected shape {expected}, got {z.shape}")
+    if not np.isfinite(z[1:steps]).all():
+        raise UsageError("measurements: expected finite numbers, got NaN or infinity")
+    if z.ndim == 2 and len(scenario.sensors) == 1:
+        x = _one_record(scenario, rows, z, printed)
+    elif printed:
+        raise UsageError("(53) as printed takes one record for all agents, of shape (steps, p)")
+    else:
+        x = _own_records(scenario, rows, np.broadcast_to(z[:, None], (len(z), n, z.shape[-1])) if z.ndim == 2 else z)
+    return States(rows.means(scenario.network), np.arange(1, steps + 1), x[..., 0], scenario.model.states)
+
+
+def mean_error(scenario: Scenario, rows: LinkRows) -> np.ndarray:
+    """What (53) leaves of the scenario's known initial error, shape (links, steps, agents, d, 1).
+
+    An error obeys the equations of an estimate in a world whose state is zero: b(k) = (I − K̄H) F b(k−1) for like
+    agents.
+
+    Raises
+    ------
+    UsageError
+        If unlike agents are too many to average over all sets of senders.
+    """
+    steps, n, d = scenario.network.steps, scenario.network.agents, scenario.model.dimension
+    if scenario.error is None:
+        return np.zeros((len(rows.link), steps, n, d, 1))
+    still = replace(scenario, x0=scenario.error, model=replace(scenario.model, Bu=np.zeros((d, 1))))
+    widths = [sensor.H.shape[-2] for sensor in scenario.sensors]
+    if len(widths) == 1:
+        return _one_record(still, rows, np.zeros((steps, widths[0])), printed=False)
+    return _own_records(still, rows, [[np.zeros(widths[kind]) for kind in scenario.sensor_of]] * steps)
+
+
+def _one_record(scenario: Scenario, rows: LinkRows, z: np.ndarray, printed: bool) -> np.ndarray:
+    (group,) = simplified.groups(scenario, rows)
+    case = group.case
+    if not isinstance(case, Case):
+        raise TypeError("like agents make one Case")
+    P, group_of, _ = simplified.covariances(scenario, rows)
+    steps, d = scenario.network.steps, scenario.model.dimension
+    items = P.transpose(1, 0, 2, 3, 4).reshape(steps, -1, d, d)
+    x = np.broadcast_to(scenario.x0, (items.shape[1], d, 1))
+    if printed and not case.shared:
+        x = x * (case.first_share() * case.arrivals[0].gained(np.zeros(case.items)))[:, None, None]
+    out = [x]
+    for step in range(2, steps + 1):
+        prior, sensor = _prior(scenario, x, items[step - 2], step), _sensor(case.sensor, step)
+        arrivals, now = case.arrivals[step - 1], z[step - 1][:, None]
+        if printed:
+            x = _printed(prior, sensor, arrivals, now, items[step - 1])
+        else:
+            x = prior.x + mean_gain(prior.P, sensor, arrivals) @ (now - sensor.H @ prior.x)
+        out.append(x)
+    by_group = np.stack(out).reshape(steps, len(rows.link), -1, d, 1).transpose(1, 0, 2, 3, 4)
+    if by_group.shape[2] == 1:
+        return np.broadcast_to(by_group, (*by_group.shape[:2], len(group_of), d, 1))
+    return by_group[:, :, group_of]
+
+
+def mean_gain(P: np.ndarray, sensor: Sensor, arrivals: Arrivals) -> np.ndarray:
+    """K̄ = Σ β(m) K_m for priors P of shape (items, d, d), shape (items, d, p)."""
+    C = np.linalg.cholesky(sensor.R)
+    A = np.linalg.solve(C, sensor.H)
+    s, U = np.linalg.eigh(A @ P @ A.T)
+    g = arrivals.gained(np.maximum(s, 0.0).T).T
+    return P @ A.T @ (U * g[:, None, :]) @ np.swapaxes(U, -1, -2) @ np.linalg.inv(C)
+
+
+def _printed(prior: Estimate, sensor: Sensor, arrivals: Arrivals, z: np.ndarray, P: np.ndarray) -> np.ndarray:
+    try:
+        before = to_information(prior)
+        local = to_information(update(prior, sensor.H, sensor.R, z))
+    except np.linalg.LinAlgError:
+        raise UsageError("(53) as printed needs an invertible prior covariance; use the consistent form") from None
+    measured = arrivals.gained(np.zeros(len(P)))[:, None, None]  # g(0) = E[m + 1]
+    return P @ (before.y + measured * (local.y - before.y))
+
+
+def _own_records(scenario: Scenario, rows: LinkRows, z: Sequence[Sequence[np.ndarray]] | np.ndarray) -> np.ndarray:
+    network, d = scenario.network, scenario.model.dimension
+    if network.agents > MOST_AGENTS:
+        raise UsageError(
+            f"records of each agent's own are averaged over all sets of senders, for at most {MOST_AGENTS} agents; "
+            f"got {network.agents}. Give one record of shape (steps, p)"
+        )
+    P, group_of, _ = simplified.covariances(scenario, rows)
+    senders = possible_senders(network.architecture, network.agents)
+    x = [np.broadcast_to(scenario.x0, (len(rows.link), d, 1))] * network.agents
+    out = [np.stack(x, axis=1)]
+    for step in range(2, network.steps + 1):
+        heard = rows.matrices(network, step)
+        kinds = [_sensor(sensor, step) for sensor in scenario.sensors]
+        sensors = [(kinds[kind].H, kinds[kind].R) for kind in scenario.sensor_of]
+        x = [
+            _over_subsets(
+                _prior(scenario, x[i], P[:, step - 2, group_of[i]], step),
+                i,
+                senders[i],
+                heard[:, i],
+                sensors,
+                z[step - 1],
+            )
+            for i in range(network.agents)
+        ]
+        out.append(np.stack(x, axis=1))
+    return np.stack(out, axis=1)
+
+
+def _over_subsets(
+    prior: Estimate,
+    own: int,
+    senders: np.ndarray,
+    heard: np.ndarray,
+    sensors: list[tuple[np.ndarray, np.ndarray]],
+    z: Sequence[np.ndarray] | np.ndarray,
+) -> np.ndarray:
+    total, start = np.zeros_like(prior.x), factor(prior.P)
+    places = range(len(senders))
+    for subset in chain.from_iterable(combinations(places, m) for m in range(len(senders) + 1)):
+        inside = np.isin(places, subset)
+        x, L = prior.x, start
+        for j in (own, *senders[inside]):
+            # one measurement after the other, so that precise sensors lose nothing
+            H, R = sensors[j]
+            L = update_factor(L, H, R)
+            x = x + posterior_gain(L, H, R) @ (z[j][:, None] - H @ x)
+        total = total + np.where(inside, heard, 1.0 - heard).prod(axis=1)[:, None, None] * x
+    return total
+
+
+def _prior(scenario: Scenario, x: np.ndarray, P: np.ndarray, step: int) -> Estimate:
+    model = scenario.model
+    return predict(Estimate(x, P), at_step(model.F, step), at_step(model.Q, step), at_step(model.Bu, step))
+
+
+def _sensor(sensor: Sensor, step: int) -> Sensor:
+    return Sensor(at_step(sensor.H, step), at_step(sensor.R, step))

@@ -1,0 +1,408 @@
+"""A scenario: everything that is given.  Read from TOML or JSON, checked once, frozen.
+
+    schema = "stochfuse.scenario/1"
+    [model]      F, H, Q, R as nested lists or a number; optional G, B, u; optional states and units (names)
+    [initial]    P, correlation = "independent" | "shared", optional x and error (a known initial bias)
+    [network]    agents, steps, architecture, link = number | matrix | one of either per step, optional delay, case
+    [[agent]]    optional, for unlike agents: its own H, R
+
+Step 1 holds the agents' initial estimates and the first exchange: nothing is predicted or measured before it (thesis
+3.1).  With correlation = "independent" the initial errors are the agents' own, so that nothing is shared at step 1;
+with "shared" all agents start from one common estimate.
+"""
+
+from __future__ import annotations
+
+import copy
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stochfuse.errors import Problem, ScenarioError, UsageError
+from stochfuse.fusion.cooperative import Relation
+from stochfuse.kalman.checks import shown
+from stochfuse.kalman.metrics import metric as metric_of
+from stochfuse.scenario.checker import Checker
+from stochfuse.scenario.model import Filter, Model, Noise, Sensor
+from stochfuse.scenario.network import LinkRows, Network, default_rows, restricted, stacked_rows, uniform_rows
+from stochfuse.scenario.registry import ESTIMATORS, METHODS
+from stochfuse.scenario.tables import read_filters, read_link, read_model, read_network, read_noise, read_sensors
+
+SCHEMA = "stochfuse.scenario/1"
+DEFAULT = "thesis-transient"
+CORRELATIONS = ("independent", "shared")
+_PRESETS = Path(__file__).parent / "presets"
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A checked scenario; make one with `load_scenario` or `Scenario.from_mapping`.
+
+    Parameters
+    ----------
+    name : the preset's or the file's name.
+    model : how the state moves.
+    sensors : the different sensors among the agents.
+    sensor_of : index into `sensors` for every agent.
+    P0 : (d, d) covariance of each agent's initial estimate.
+    correlation : "independent" or "shared".
+    x0 : (d, 1) initial state estimate.
+    error : (d, 1) known initial error, or None.
+    network : agents and links.
+    metric : the metric that the scenario asks to be shown, or None.
+    source : the mapping it was made from, as the file has it.
+    own : whether every agent has a state of its own.
+    filters : each agent's own filter, where they differ from the model; else empty.
+    noise : how measurement noises hang together, or None if they are independent.
+    process : (Σd_i, Σd_i) process noise of all parallel filters together, or None if they have nothing in common.
+    relations : what agent i measures of agent j, by (i, j) counted from 0.
+    agent : number of the agent that the scenario asks to be shown, or None.
+    method, estimator, runs : what the scenario asks to be predicted by, or None.
+    """
+
+    name: str
+    model: Model
+    sensors: tuple[Sensor, ...]
+    sensor_of: tuple[int, ...]
+    P0: np.ndarray
+    correlation: str
+    x0: np.ndarray
+    error: np.ndarray | None
+    network: Network
+    metric: str | None
+    source: Mapping[str, Any]
+    own: bool = False
+    filters: tuple[Filter, ...] = ()
+    noise: Noise | None = None
+    process: np.ndarray | None = None
+    relations: Mapping[tuple[int, int], Relation] = field(default_factory=dict)
+    agent: int | None = None
+    method: str | None = None
+    estimator: str | None = None
+    runs: int | None = None
+
+    @property
+    def kind_of(self) -> tuple[int, ...]:
+        """Kind of every agent: those of one kind may change places."""
+        alike = one_state(self)
+        if self.noise is not None:
+            c = self.noise.correlation
+            alike &= len(set(c[~np.eye(len(c), dtype=bool)])) <= 1 and self.noise.disturbance is None
+        return self.sensor_of if alike else tuple(range(self.network.agents))
+
+    @classmethod
+    def from_mapping(cls, mapping: Mapping[str, Any], name: str = "scenario") -> Scenario:
+        """Check a mapping with a scenario file's keys and make the scenario.
+
+        Raises
+        ------
+        ScenarioError
+            Naming every offending key, what was expected there and what came.
+        """
+        from stochfuse.scenario.schema import structure_problems
+
+        return _build(mapping, name, structure_problems(mapping))
+
+    def until(self, step: int) -> Scenario:
+        """Return the same up to an earlier step."""
+        network = replace(
+            self.network,
+            steps=step,
+            link=None if self.network.link is None else _first(self.network.link, step),
+            cases=tuple((name, _first(link, step)) for name, link in self.network.cases),
+        )
+        source = dict(self.source)
+        source["network"] = {**source.get("network", {}), "steps": step}
+        return replace(self, network=network, source=source)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the mapping that the scenario was made from, with a file's keys."""
+        return {"schema": SCHEMA, **copy.deepcopy(dict(self.source))}
+
+
+def one_state(scenario: Scenario) -> bool:
+    """Whether all agents track the state of one model."""
+    return not scenario.own and not scenario.filters
+
+
+def require_one_state(scenario: Scenario, who: str) -> None:
+    """Raise UsageError unless all agents track the state of one model."""
+    if not one_state(scenario):
+        what = "states of their own (model.own)" if scenario.own else "filters of their own"
+        raise UsageError(f"{who}: expected agents that track one state by one model, got agents with {what}")
+
+
+def require_independent_noise(scenario: Scenario, who: str) -> None:
+    """Raise UsageError if measurement noises hang together."""
+    if scenario.noise is not None:
+        raise UsageError(
+            f"{who}: expected independent measurement noises, got [noise] with a correlation or a disturbance"
+        )
+
+
+def _first(link: np.ndarray, steps: int) -> np.ndarray:
+    return link[:steps] if link.ndim in (1, 3) else link
+
+
+def preset_names() -> list[str]:
+    """Names of the scenarios that come with the package."""
+    return sorted(path.stem for path in _PRESETS.glob("*.toml"))
+
+
+def load_scenario(source: str | Path = DEFAULT, **overrides: Any) -> Scenario:
+    """Read a scenario.
+
+    Parameters
+    ----------
+    source : a preset's name, a TOML or JSON file's path, or "-" for standard input.
+    **overrides : agents, steps, architecture, q, r, p0: numbers that take the place of network.agents, network.steps,
+        network.architecture, model.Q, model.R and initial.P; `uniform_link=True` drops the file's link and cases, for a
+        caller who gives the link probability.  For a state of several dimensions a number is that multiple of the
+        identity.
+
+    Raises
+    ------
+    ScenarioError
+        If the file is missing or malformed, or naming every offending key.
+    """
+    name, text = read_text(source)
+    mapping = _override(parse(name, text), overrides)
+    if is_preset(source):
+        # the presets' structure is checked by the tests; pydantic would double the time of a plain `predict`
+        return _build(mapping, name, [])
+    return Scenario.from_mapping(mapping, name)
+
+
+def link_rows(scenario: Scenario, link: Any = None) -> LinkRows:
+    """Return the rows of link probability that a caller asks for, checked.
+
+    Parameters
+    ----------
+    link : link probabilities, one row each; or an array of shape (rows, agents, agents), one matrix each.  Default: the
+        scenario's cases, else its link, else 0, 0.25, 0.5, 0.75 and 1.
+
+    Raises
+    ------
+    UsageError
+        If they are no probabilities or do not fit the agents.
+    """
+    network, check = scenario.network, Checker()
+    if isinstance(link, LinkRows):
+        return link
+    if link is None:
+        return default_rows(network)
+    expected = f"link probabilities, or one {network.agents}×{network.agents} matrix of them per row"
+    array = check.array("link", link, expected)
+    if array is not None and array.ndim <= 1 and array.size:
+        if array.min() >= 0 and array.max() <= 1:
+            return restricted(uniform_rows(np.atleast_1d(array)), network)
+        check.note("link", "probabilities between 0 and 1", f"{array.min() if array.min() < 0 else array.max():g}")
+    elif array is not None and array.ndim == 3 and array.size:
+        matrices = [
+            read_link(check, "link", matrix, network.agents, network.steps, network.architecture) for matrix in array
+        ]
+        if not check.problems:
+            return restricted(stacked_rows(None, [m for m in matrices if m is not None], network), network)
+    elif array is not None:
+        check.note("link", expected, f"an array of shape {array.shape}")
+    raise UsageError("; ".join(map(str, check.problems)))
+
+
+def is_preset(source: str | Path) -> bool:
+    """Whether a source names a preset (a file of that name in the working directory does not hide it)."""
+    return isinstance(source, str) and source in preset_names()
+
+
+def read_text(source: str | Path) -> tuple[str, str]:
+    """Return name and text of a preset, a file or standard input."""
+    if is_preset(source):
+        return str(source), (_PRESETS / f"{source}.toml").read_text(encoding="utf-8")
+    known = ", ".join(preset_names())
+    return read_file(source, f"no such file, and no preset of that name (presets: {known})")
+
+
+def read_file(source: str | Path, missing: str = "no such file") -> tuple[str, str]:
+    """Return name and text of a file, or of standard input for "-".
+
+    Raises
+    ------
+    ScenarioError
+        If it cannot be read; `missing` is what to say where there is none.
+    """
+    if source == "-":
+        if sys.stdin is None:
+            raise ScenarioError("standard input", "closed")
+        return "standard input", sys.stdin.read()
+    if str(source) == "":
+        raise ScenarioError("scenario", "expected a file or a preset's name, got nothing")
+    path = Path(source)
+    try:
+        return str(path), path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ScenarioError(str(path), missing) from None
+    except UnicodeDecodeError as error:
+        raise ScenarioError(str(path), f"not a text file in UTF-8 (byte {error.start})") from None
+    except OSError as error:
+        raise ScenarioError(str(path), f"cannot be read: {error.strerror}") from None
+    except ValueError:
+        raise ScenarioError(shown(str(path)), "no name that a file can have") from None
+
+
+def parse(name: str, text: str, help: str = "`stochfuse scenario new`") -> dict[str, Any]:
+    """Parse TOML, or JSON if the text begins with a brace; `help` is what an empty text's author should see."""
+    try:
+        if text.lstrip("\ufeff \t\r\n").startswith("{") or name.lower().endswith(".json"):
+            import json
+
+            mapping = json.loads(text.lstrip("\ufeff"))
+        else:
+            import tomllib
+
+            mapping = tomllib.loads(text.lstrip("\ufeff"))
+    except RecursionError:
+        raise ScenarioError(name, "nested too deeply") from None
+    except ValueError as error:
+        raise ScenarioError(
+            name, f"not valid {'JSON' if 'json' in type(error).__module__ else 'TOML'}: {error}"
+        ) from None
+    if not isinstance(mapping, dict):
+        raise ScenarioError(name, f"expected a table of keys, got {shown(mapping)}")
+    if not mapping:
+        raise ScenarioError(name, f"empty; see {help}")
+    return mapping
+
+
+def _override(mapping: dict[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    places = {
+        "agents": ("network", "agents"),
+        "steps": ("network", "steps"),
+        "architecture": ("network", "architecture"),
+        "q": ("model", "Q"),
+        "r": ("model", "R"),
+        "p0": ("initial", "P"),
+    }
+    network = mapping.get("network")
+    if overrides.get("uniform_link") and isinstance(network, dict):
+        mapping["network"] = {key: value for key, value in network.items() if key not in ("link", "case", "burst")}
+    for key, value in overrides.items():
+        if value is None or key == "uniform_link":
+            continue
+        if key not in places:
+            raise TypeError(f"load_scenario() got an unexpected keyword argument '{key}'")
+        table, entry = places[key]
+        if isinstance(mapping.setdefault(table, {}), dict):
+            mapping[table][entry] = value
+    return mapping
+
+
+def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> Scenario:
+    if not isinstance(mapping, Mapping):
+        raise ScenarioError(name, structure)
+    check = Checker(skip={problem.path for problem in structure})
+    names = ("model", "initial", "network", "noise", "report")
+    tables = {key: mapping[key] if isinstance(mapping.get(key), dict) else {} for key in names}
+    agents, initial = mapping.get("agent"), tables["initial"]
+    agents = agents if isinstance(agents, list) else None
+    network = read_network(check, tables["network"])
+    own = tables["model"].get("own") is True
+    if isinstance(mapping.get("navigation"), dict):
+        (model, P0), default = _navigation(check, mapping, network), None
+    else:
+        model, default = read_model(check, tables["model"], network.steps if network else 1)
+        P0 = check.covariance("initial.P", initial.get("P"), model.dimension if model else None, 0)
+    d = model.dimension if model else None
+    filters = read_filters(check, agents, model, P0, own, network)
+    sensors, sensor_of = read_sensors(check, agents, default, d, filters, network)
+    correlation = check.choice("initial.correlation", initial.get("correlation", "independent"), CORRELATIONS)
+    if correlation == "shared" and (own or filters):
+        check.note("initial.correlation", '"independent", since agents have states or filters of their own', "'shared'")
+    x0 = check.vector("initial.x", initial.get("x"), d)
+    error = check.vector("initial.error", initial.get("error"), d)
+    noise, process = None, None
+    if network is not None and len(sensor_of) == network.agents:
+        noise, process = read_noise(check, tables["noise"], [sensors[s] for s in sensor_of], filters, own)
+    relations = _relations(check, mapping, model, network, own)
+    shown = _report(check, tables["report"], model, network)
+    problems = [*structure, *check.problems]
+    if problems:
+        raise ScenarioError(name, problems)
+    if model is None or network is None or P0 is None or correlation is None:
+        raise ScenarioError(name, "incomplete: [model], [initial] and [network] are needed")
+    return Scenario(
+        name=name,
+        model=model,
+        sensors=sensors,
+        sensor_of=sensor_of,
+        P0=P0,
+        correlation=correlation,
+        x0=np.zeros((model.dimension, 1)) if x0 is None else x0,
+        error=error,
+        network=network,
+        source={key: value for key, value in mapping.items() if key != "schema"},
+        own=own,
+        filters=filters,
+        noise=noise,
+        process=process,
+        relations=relations,
+        **shown,
+    )
+
+
+def _report(check: Checker, table: Mapping[str, Any], model: Model | None, network: Network | None) -> dict[str, Any]:
+    """How the scenario asks to be predicted and shown: metric, agent, method, estimator and runs."""
+    metric = table.get("metric")
+    if isinstance(metric, str) and model is not None:
+        try:
+            metric_of(metric, model)
+        except UsageError as reason:
+            check.note("report.metric", "a metric of this model", f"'{metric}' ({reason})")
+    method = check.choice("report.method", table.get("method"), METHODS)
+    estimator = check.choice("report.estimator", table.get("estimator"), ESTIMATORS)
+    if estimator is not None and method not in (None, "general", "monte-carlo"):
+        check.note("report.estimator", 'report.method "general" or "monte-carlo", which average it', f'"{method}"')
+    runs = check.integer("report.runs", table.get("runs"), 2)
+    if method is None and (estimator is not None or runs is not None):
+        method = "general" if runs is None else "monte-carlo"
+    agent = check.integer("report.agent", table.get("agent"), 1)
+    if agent is not None and network is not None and agent > network.agents:
+        check.note("report.agent", f"an agent from 1 to {network.agents}", str(agent))
+    return {"metric": metric, "agent": agent, "method": method, "estimator": estimator, "runs": runs}
+
+
+def _navigation(
+    check: Checker, mapping: Mapping[str, Any], network: Network | None
+) -> tuple[Model | None, np.ndarray | None]:
+    """Model and first covariance of an inertial navigation system."""
+    from stochfuse.scenario.navigation import read_navigation
+
+    for key in ("model", "initial"):
+        if key in mapping:
+            check.note(key, "nothing beside [navigation], which takes its place", "a table")
+    errors = read_navigation(check, mapping["navigation"], network.steps if network else 1)
+    if errors is None:
+        return None, None
+    return Model(errors.F, errors.Q, np.zeros((len(errors.P0), 1)), errors.states, errors.units), errors.P0
+
+
+def _relations(
+    check: Checker, mapping: Mapping[str, Any], model: Model | None, network: Network | None, own: bool
+) -> Mapping[tuple[int, int], Relation]:
+    """What agents measure of each other."""
+    agents = mapping.get("agent")
+    tables = [table for table in agents if isinstance(table, dict)] if isinstance(agents, list) else []
+    if "cooperative" not in mapping and not any("position" in table for table in tables):
+        if own:
+            check.note("cooperative", "what agents with states of their own measure of each other", "nothing")
+        return {}
+    if model is None or network is None:
+        return {}
+    from stochfuse.scenario.cooperative import read_cooperative
+
+    if not own:
+        check.note("model.own", "true, since agents measure each other's own places", "false")
+    found = read_cooperative(check, mapping.get("cooperative"), tables, model.states, network.agents, network.steps)
+    return {} if found is None else found.pairs

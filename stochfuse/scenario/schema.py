@@ -1,0 +1,330 @@
+"""The structure of a scenario file, for pydantic: which keys there are and what kind of value each takes.
+
+Whether the numbers fit together (shapes, definiteness, probabilities) is checked where the tables are read
+(`stochfuse.scenario.scenario`), for every scenario, wherever it comes from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
+
+from stochfuse.errors import Problem
+from stochfuse.kalman.checks import shown
+
+Number = Annotated[int, Strict()] | Annotated[float, Strict()]
+
+
+class Table(BaseModel):
+    """A table: unknown keys are errors, and numbers that are not finite are left to the reading."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=True)
+
+
+Whole = Annotated[int, Strict()]
+Flag = Annotated[bool, Strict()]
+
+
+class PairTable(Table):
+    """What one pair of agents measures, in place of what all pairs measure."""
+
+    agents: list[Whole] = Field(description="the observer and the other, counted from 1")
+    range: Number | None = Field(None, description="standard deviation of the distance; left out, none is measured")
+    direction: Number | None = Field(
+        None, description="standard deviation of the line of sight in rad; left out, none is measured"
+    )
+    none: Flag = Field(False, description="true: the two communicate and measure nothing of each other")
+    both_ways: Flag = Field(True, description="whether the other measures the observer likewise, with noise of its own")
+
+
+class CooperativeTable(Table):
+    """Agents that measure each other: relative range, line-of-sight direction, or both."""
+
+    positions: list[str] = Field(description="names of the 2 or 3 states that are the place")
+    range: Number | None = Field(
+        None, description="standard deviation of the distance of every pair, in the places' unit"
+    )
+    direction: Number | None = Field(
+        None, description="standard deviation of the line of sight of every pair, in rad (of each of the two angles)"
+    )
+    pair: list[PairTable] | None = Field(None, description="pairs that measure otherwise")
+
+
+Real = Annotated[float, Strict()]
+
+
+class LegTable(Table):
+    """A part of the nominal way, with constant manoeuvre."""
+
+    duration: Real = Field(description="s")
+    acceleration: Real = Field(0.0, description="of the ground speed, m/s²")
+    turn_rate: Real = Field(0.0, description="of the heading, °/s, positive to the right")
+    climb: Real = Field(0.0, description="rate of climb at the end of the leg, reached evenly, m/s")
+
+
+class ImuTable(Table):
+    """The inertial measurement unit, in the units of data sheets; alike on its three axes."""
+
+    angle_random_walk: Real = Field(description="white noise of the gyros, °/√h")
+    velocity_random_walk: Real = Field(description="white noise of the accelerometers, m/s/√h")
+    gyro_bias: Real = Field(description="turn-on bias, standard deviation, °/h")
+    gyro_instability: Real = Field(description="in-run bias, standard deviation, °/h")
+    gyro_time: Real = Field(description="correlation time of the gyros' bias, s")
+    accelerometer_bias: Real = Field(description="turn-on bias, standard deviation, mg")
+    accelerometer_instability: Real = Field(description="in-run bias, standard deviation, mg")
+    accelerometer_time: Real = Field(description="correlation time of the accelerometers' bias, s")
+
+
+class InitialErrorsTable(Table):
+    """Standard deviations of the first estimate, along north, east and down; the biases' are the IMU's."""
+
+    attitude: list[Real] = Field(description="about north, about east, of the heading, °")
+    velocity: list[Real] = Field(description="m/s")
+    position: list[Real] = Field(description="m")
+
+
+class NavigationTable(Table):
+    """An inertial navigation system's 15 errors along a nominal way: takes the place of F, Q and the first P."""
+
+    latitude: Real = Field(description="at the start, °")
+    height: Real = Field(0.0, description="at the start, m above the ellipsoid")
+    speed: Real = Field(description="ground speed at the start, m/s")
+    heading: Real = Field(0.0, description="at the start, ° from north to the right")
+    rate: Real = Field(100.0, description="propagation ticks per second, Hz")
+    interval: Real = Field(1.0, description="from one step to the next, s; a whole number of ticks")
+    leg: list[LegTable] = Field(description="the way, one [[navigation.leg]] after another")
+    imu: ImuTable
+    initial: InitialErrorsTable
+
+
+Vector = Number | list[Number] | list[list[Number]]
+Matrix = Number | list[list[Number]] | list[list[list[Number]]]
+Link = Number | list[Number | list[Number] | list[list[Number]]]
+
+
+class ModelTable(Table):
+    """Linear-Gaussian model x(k) = F x(k−1) + B u + G v, z(k) = H x(k) + w, with v ~ N(0, Q), w ~ N(0, R)."""
+
+    F: Matrix = Field(description="state transition, d×d; its size is the number of states")
+    H: Matrix = Field(description="measurement matrix, p×d")
+    Q: Matrix = Field(description="process noise covariance, d×d, or as many as G has columns")
+    R: Matrix = Field(description="measurement noise covariance, p×p, positive definite")
+    own: bool = Field(False, strict=True, description="true: every agent has a state of its own, all of this model")
+    G: Matrix | None = Field(None, description="process noise gain, default the identity")
+    B: Matrix | None = Field(None, description="input matrix")
+    u: Vector | None = Field(None, description="known input, needs B")
+    states: list[str] | None = Field(None, description="names of the states")
+    units: list[str] | None = Field(None, description="units of the states")
+
+
+class InitialTable(Table):
+    """The estimates that the agents start with, at step 1."""
+
+    P: Matrix = Field(description="covariance of each agent's first estimate, d×d")
+    correlation: Literal["independent", "shared"] = Field(
+        "independent", description="whether the agents' first errors are independent, or all start from one estimate"
+    )
+    x: Vector | None = Field(None, description="first state estimate, default zero")
+    error: Vector | None = Field(None, description="known initial error (bias), common to all agents")
+
+
+class BurstTable(Table):
+    """A bursty link (Gilbert and Elliott): good or bad, with a memory; each link on its own."""
+
+    good_to_bad: Number = Field(description="probability that a good link is bad in the next step")
+    bad_to_good: Number = Field(description="probability that a bad link is good in the next step")
+    good: Number = Field(1.0, description="delivery probability of a good link")
+    bad: Number = Field(0.0, description="delivery probability of a bad link")
+
+
+class CaseTable(Table):
+    """A named alternative to network.link."""
+
+    name: str
+    link: Link | None = Field(None, description="as network.link; default network.link itself")
+    burst: BurstTable | None = Field(None, description="as network.burst, instead of a link")
+
+
+class NetworkTable(Table):
+    """Who may hear whom, and how likely."""
+
+    agents: int = Field(ge=1, strict=True, description="number of agents")
+    steps: int = Field(ge=1, strict=True, description="number of time steps; step 1 exchanges the first estimates")
+    architecture: Literal["ad-hoc", "broadcast", "cyclic"] = "ad-hoc"
+    link: Link | None = Field(
+        None,
+        description="link probability: a number, a matrix (row: receiver, column: sender), or one of either per step; "
+        "left out, it is tabulated from 0 to 1",
+    )
+    burst: BurstTable | None = Field(None, description="bursty links, instead of a link probability")
+    hears: list[list[int]] | None = Field(
+        None, description="for each agent the agents that it may hear; default: all that the architecture lets it hear"
+    )
+    delay: Number | list[Number] | None = Field(
+        None, description="delay of messages in steps, or the probabilities of a delay of 0, 1, 2 … steps"
+    )
+    case: list[CaseTable] | None = Field(None, description="named alternatives to link, one row of the table each")
+
+
+class AgentTable(Table):
+    """One agent's own sensor, filter and place, where they differ from the model's."""
+
+    H: Matrix | None = None
+    R: Matrix | None = None
+    sensor: bool = Field(True, strict=True, description="false: this agent measures nothing itself")
+    F: Matrix | None = Field(None, description="transition of the agent's own filter")
+    Q: Matrix | None = Field(None, description="process noise of the agent's own filter")
+    P: Matrix | None = Field(None, description="covariance of the agent's first estimate")
+    M: Matrix | None = Field(None, description="mapping of a parallel filter's state into the state, x = M x_i + s")
+    s: Vector | None = Field(None, description="offset of that mapping, default zero")
+    position: Vector | None = Field(None, description="nominal place for cooperative measurements, or one per step")
+
+
+class NoiseTable(Table):
+    """How noises hang together that are otherwise independent."""
+
+    correlation: Number | list[list[Number]] | None = Field(
+        None, description="correlation of the agents' measurement noises: one number for all pairs, or a matrix"
+    )
+    disturbance: Number | list[Number] | list[list[Number]] | None = Field(
+        None,
+        description="bound on the covariance of an uncertain disturbance of the measurements: a variance for every "
+        "component, the variances of one sensor's components, or a matrix over all agents' components",
+    )
+    process: list[list[Number]] | None = Field(
+        None, description="process noise covariance of all parallel filters together, their states one below another"
+    )
+
+
+class ReportTable(Table):
+    """How results are shown where the command does not say."""
+
+    metric: str | None = Field(None, description="default metric, as --metric takes it")
+    method: str | None = Field(
+        None, description="default method; where an estimator is named general, where runs are monte-carlo"
+    )
+    estimator: str | None = Field(None, description="default estimator, as --estimator takes it")
+    runs: int | None = Field(None, ge=2, strict=True, description="default runs of method monte-carlo")
+    agent: int | None = Field(None, ge=1, strict=True, description="whose estimate is shown; default: the mean")
+
+
+class ScenarioFile(Table):
+    """A stochfuse scenario."""
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, title="stochfuse scenario", populate_by_name=False, serialize_by_alias=True
+    )
+
+    schema_: Literal["stochfuse.scenario/1"] = Field("stochfuse.scenario/1", alias="schema")
+    description: str | None = None
+    model: ModelTable | None = Field(None, description="needed unless there is a navigation table")
+    initial: InitialTable | None = Field(None, description="needed unless there is a navigation table")
+    navigation: NavigationTable | None = Field(None, description="inertial navigation, instead of model and initial")
+    network: NetworkTable
+    noise: NoiseTable | None = None
+    cooperative: CooperativeTable | None = None
+    agent: list[AgentTable] | None = Field(None, description="one entry per agent, for unlike agents")
+    report: ReportTable | None = None
+
+
+_KINDS = {
+    "extra_forbidden": "a known key",
+    "missing": "a value",
+    "string_type": "text",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "float_type": "a number",
+    "list_type": "a list",
+    "bool_type": "true or false",
+    "model_type": "a table",
+    "dict_type": "a table",
+    "model_attributes_type": "a table",
+}
+
+_SHAPES = {
+    "matrix": "a number or a matrix (a list of rows), or one such matrix per step",
+    "vector": "a number, a list of numbers, or one list per step",
+    "link": "a probability, a matrix of them, or one of either per step",
+    "delay": "a number of steps or a list of probabilities",
+    "place": "a list of coordinates, or one such list per step",
+    "correlation": "a number or a matrix (a list of rows)",
+    "disturbance": "a variance, a list of variances, or a matrix (a list of rows)",
+}
+_SHAPE_OF = {
+    **dict.fromkeys(("F", "H", "Q", "R", "G", "B", "P", "M"), "matrix"),
+    **dict.fromkeys(("u", "x", "error", "s"), "vector"),
+    "position": "place",
+    "disturbance": "disturbance",
+    "link": "link",
+    "delay": "delay",
+}
+
+
+def structure_problems(mapping: Any) -> list[Problem]:
+    """Return every key of a parsed file that is unknown, missing or of the wrong kind, once each."""
+    problems = []
+    if isinstance(mapping, dict) and "navigation" not in mapping:
+        problems = [Problem(key, "a value", "nothing") for key in ("model", "initial") if key not in mapping]
+    known = {problem.path for problem in problems}
+    return problems + [problem for problem in problems_of(ScenarioFile, mapping) if problem.path not in known]
+
+
+def problems_of(
+    structure: type[Table], mapping: Any, expected: Mapping[str, str] = MappingProxyType({})
+) -> list[Problem]:
+    """Return every key of a parsed file that does not fit a structure, once each.
+
+    Parameters
+    ----------
+    expected : what some keys take, by their paths, where the structure alone would not say it well.
+    """
+    problems: dict[str, Problem] = {}
+    try:
+        structure.model_validate(mapping)
+    except ValidationError as error:
+        for entry in error.errors(include_url=False, include_context=True):
+            problem = _problem(entry)
+            for path, words in expected.items():
+                if problem.path == path or problem.path.startswith((f"{path}.", f"{path}[")):
+                    got = "nothing" if entry["type"] == "missing" else _got(entry, [])
+                    problem = Problem(path, words, got)
+            problems.setdefault(problem.path, problem)
+    return list(problems.values())
+
+
+def _problem(entry: Any) -> Problem:
+    location = list(entry["loc"])
+    if location[:2] == ["noise", "correlation"]:
+        return Problem("noise.correlation", _SHAPES["correlation"], _got(entry, location[2:]))
+    for place, part in enumerate(location):
+        if (part in _SHAPE_OF and place < len(location) - 1) or (part in _SHAPE_OF and entry["type"].endswith("_type")):
+            # a union reports one error per alternative: say once what the key takes
+            return Problem(_path(location[: place + 1]), _SHAPES[_SHAPE_OF[part]], _got(entry, location[place + 1 :]))
+    kind, context = entry["type"], entry.get("ctx", {})
+    if kind == "literal_error":
+        expected = "one of " + str(context["expected"]).replace("'", '"').replace(" or ", ", ")
+    elif kind == "greater_than_equal":
+        expected = f"a whole number of at least {context['ge']}"
+    else:
+        expected = _KINDS.get(kind, str(entry["msg"]))
+    if kind == "extra_forbidden":
+        got = f"an unknown one, '{location[-1]}'"
+    else:
+        got = "nothing" if kind == "missing" else shown(entry["input"])
+    return Problem(_path(location) or "scenario", expected, got)
+
+
+def _got(entry: Any, rest: list[Any]) -> str:
+    indices = [part for part in rest if isinstance(part, int)]
+    where = f" at [{', '.join(map(str, indices))}]" if indices else ""
+    return shown(entry["input"]) + where
+
+
+def _path(location: list[Any]) -> str:
+    path = ""
+    for part in location:
+        path += f"[{part + 1}]" if isinstance(part, int) else f".{part}" if path else str(part)
+    return path

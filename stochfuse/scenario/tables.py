@@ -1,0 +1,359 @@
+"""The tables of a scenario file, read and checked: what fits together becomes a model, sensors and a network.
+
+The [noise] table of a scenario file: noises that hang together and are otherwise taken for independent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from stochfuse.kalman.checks import shown
+from stochfuse.scenario.checker import Checker
+from stochfuse.scenario.model import Filter, Model, Noise, Sensor
+from stochfuse.scenario.network import ARCHITECTURES, Network, mean_delivery
+
+MOST_DELAY = 10_000
+"""Largest delay of a message, in steps."""
+
+
+def read_network(check: Checker, table: Mapping[str, Any]) -> Network | None:
+    """Read [network]; None where something essential is wrong, which the checker has noted."""
+    agents = check.integer("network.agents", table.get("agents"), 1)
+    steps = check.integer("network.steps", table.get("steps"), 1)
+    architecture = check.choice("network.architecture", table.get("architecture", "ad-hoc"), ARCHITECTURES)
+    if agents is None or steps is None or architecture is None:
+        if isinstance(table.get("link"), int | float):
+            check.link("network.link", table["link"], 1, 1)
+        return None
+    link = read_link(check, "network.link", table.get("link"), agents, steps, architecture)
+    burst = _burst(check, "network", table)
+    link = link if burst is None else mean_delivery(burst)
+    cases, bursts = [], []
+    given = table.get("case")
+    for i, case in enumerate(given if isinstance(given, list) else [], start=1):
+        if not isinstance(case, dict):
+            continue
+        path = f"network.case[{i}].link"
+        own = link if case.get("link") is None else read_link(check, path, case["link"], agents, steps, architecture)
+        bursty = burst if case.get("link") is None else None
+        if case.get("burst") is not None:
+            bursty = _burst(check, f"network.case[{i}]", case)
+            own = own if bursty is None else mean_delivery(bursty)
+        given_name = case.get("name", i)
+        name = given_name if isinstance(given_name, str) else str(i)
+        check.name(f"network.case[{i}].name", name)
+        if name in [other for other, _ in cases]:
+            check.note(f"network.case[{i}].name", "a name of its own", shown(name))
+        if own is None and case.get("link") is None and case.get("burst") is None:
+            check.note(path, "a link probability here or in network.link", "nothing")
+        elif own is not None:
+            cases.append((name, own))
+            bursts.append(bursty)
+    delay = _delay(check, table.get("delay"))
+    hears = _hears(check, table.get("hears"), agents, architecture)
+    if hears is not None and any(b is not None for b in (burst, *bursts)):
+        check.note("network.hears", "links without memory (no burst)", "a burst")
+    return Network(agents, steps, architecture, link, tuple(cases), delay, burst, tuple(bursts), hears)
+
+
+def _hears(check: Checker, value: Any, agents: int, architecture: str) -> np.ndarray | None:
+    if not isinstance(value, list):
+        return None
+    if architecture != "ad-hoc":
+        check.note("network.hears", 'nothing unless network.architecture is "ad-hoc"', f'"{architecture}"')
+    if len(value) != agents:
+        check.note("network.hears", f"one list for each of the {agents} agents", f"{len(value)}")
+        return None
+    hears = np.zeros((agents, agents), dtype=bool)
+    for i, others in enumerate(value):
+        others = others if isinstance(others, list) else []
+        known = [j for j in others if isinstance(j, int) and 1 <= j <= agents and j != i + 1]
+        if len(set(known)) < len(others):
+            check.note(f"network.hears[{i + 1}]", f"other agents from 1 to {agents}, each once", shown(others))
+        hears[i, [j - 1 for j in known]] = True
+    return hears
+
+
+def _burst(check: Checker, path: str, table: Mapping[str, Any]) -> np.ndarray | None:
+    given = table.get("burst")
+    if not isinstance(given, dict):
+        return None
+    path = f"{path}.burst"
+    if table.get("link") is not None:
+        check.note(path, "either a link probability or a burst", "both")
+    keys = {"good_to_bad": None, "bad_to_good": None, "good": 1.0, "bad": 0.0}
+    values = []
+    for key, default in keys.items():
+        value = given.get(key, default)
+        if value is None:
+            check.note(f"{path}.{key}", "a probability", "nothing")
+            continue
+        number = check.array(f"{path}.{key}", value, "a probability")
+        if number is not None and (number.ndim or not 0 <= number <= 1):
+            check.note(f"{path}.{key}", "a probability", shown(value))
+        elif number is not None:
+            values.append(float(number))
+    if len(values) < len(keys):
+        return None
+    if values[0] + values[1] == 0:
+        check.note(path, "good_to_bad or bad_to_good above 0, so that the share of good steps is known", "0 for both")
+        return None
+    return np.array(values)
+
+
+def read_link(check: Checker, path: str, value: Any, agents: int, steps: int, architecture: str) -> np.ndarray | None:
+    """Read link probabilities of shape (), (n, n), (steps,) or (steps, n, n)."""
+    link = check.link(path, value, agents, steps)
+    _check_broadcast(check, path, link, agents, architecture)
+    return link
+
+
+def _check_broadcast(check: Checker, path: str, link: np.ndarray | None, agents: int, architecture: str) -> None:
+    if link is not None and link.ndim >= 2 and architecture == "broadcast":
+        others = np.where(np.eye(agents, dtype=bool), np.nan, link)
+        with np.errstate(invalid="ignore"):
+            uneven = agents > 2 and (np.nanmax(others, axis=-2) != np.nanmin(others, axis=-2)).any()
+        if uneven:
+            check.note(
+                path, "equal probabilities in each column (a broadcast is heard by all or by none)", "unequal ones"
+            )
+
+
+def _delay(check: Checker, value: Any) -> tuple[float, ...]:
+    array = check.array("network.delay", value, "a number of steps or a list of probabilities")
+    if array is None:
+        return (1.0,)
+    if array.ndim == 0:
+        if array < 0 or array != int(array):
+            check.note(
+                "network.delay", "a whole number of steps, or the probabilities of 0, 1, 2 … steps", shown(value)
+            )
+            return (1.0,)
+        if array > MOST_DELAY:
+            check.note("network.delay", f"at most {MOST_DELAY} steps", shown(value))
+            return (1.0,)
+        return (0.0,) * int(array) + (1.0,)
+    if array.ndim != 1 or not array.size or (array < 0).any() or abs(array.sum() - 1) > 1e-9:
+        check.note("network.delay", "probabilities of 0, 1, 2 … steps that sum to 1", shown(value))
+        return (1.0,)
+    return tuple(array.tolist())
+
+
+def read_model(check: Checker, table: Mapping[str, Any], steps: int) -> tuple[Model | None, Sensor | None]:
+    """Read [model]: the model, and the sensor of agents that have no other."""
+    F = check.matrix("model.F", table.get("F"), None, None, steps)
+    if F is not None and F.shape[-1] != F.shape[-2]:
+        check.note("model.F", "a square matrix", f"a {F.shape[-2]}×{F.shape[-1]} matrix")
+        F = None
+    d = None if F is None else F.shape[-1]
+    G = check.matrix("model.G", table.get("G"), d, None, steps, identity=True)
+    noises = G.shape[-1] if G is not None else None if table.get("G") is not None else d
+    Q = check.covariance("model.Q", table.get("Q"), noises, steps)
+    B = check.matrix("model.B", table.get("B"), d, None, steps)
+    u = check.vector("model.u", table.get("u"), None if B is None else B.shape[-1], steps)
+    if table.get("u") is not None and table.get("B") is None:
+        check.note("model.B", "an input matrix, since model.u is given", "nothing")
+    states = _names(check, "model.states", table.get("states"), d)
+    units = _names(check, "model.units", table.get("units"), d)
+    default = _sensor(check, "model", table, d, steps, None)
+    if F is None or Q is None or d is None:
+        return None, default
+    model = Model(
+        F=F,
+        Q=Q if G is None else G @ Q @ np.swapaxes(G, -1, -2),
+        Bu=np.zeros((d, 1)) if B is None or u is None else B @ u,
+        states=states or tuple("x" if d == 1 else f"x{i}" for i in range(1, d + 1)),
+        units=units or ("",) * d,
+    )
+    return model, default
+
+
+def _names(check: Checker, path: str, value: Any, d: int | None) -> tuple[str, ...] | None:
+    if not isinstance(value, list) or d is None or not all(isinstance(name, str) for name in value):
+        return None
+    if len(value) != d:
+        check.note(path, f"{d} names, one per state", f"{len(value)}")
+        return None
+    if path.endswith("states") and len(set(value)) < d:
+        check.note(path, "different names", shown(value))
+    for i, name in enumerate(value, start=1):
+        check.name(f"{path}[{i}]", str(name), of_state=path.endswith("states"))
+    return tuple(map(str, value))
+
+
+def _sensor(
+    check: Checker, path: str, table: Mapping[str, Any], d: int | None, steps: int, default: Sensor | None
+) -> Sensor | None:
+    if table.get("H") is None and default is not None:
+        H = default.H
+    else:
+        H = check.matrix(f"{path}.H", table.get("H"), None, d, steps)
+    if table.get("R") is None and default is not None:
+        R = default.R
+        if H is not None and R.shape[-1] != H.shape[-2]:
+            check.note(f"{path}.R", f"a {H.shape[-2]}×{H.shape[-2]} matrix, to go with its own H", "nothing")
+    else:
+        R = check.covariance(f"{path}.R", table.get("R"), None if H is None else H.shape[-2], steps, definite=True)
+    return None if H is None or R is None else Sensor(H, R)
+
+
+def read_sensors(
+    check: Checker,
+    agents: Any,
+    default: Sensor | None,
+    d: int | None,
+    filters: Sequence[Filter],
+    network: Network | None,
+) -> tuple[tuple[Sensor, ...], tuple[int, ...]]:
+    """Read [[agent]]: the different sensors, and which of them every agent has."""
+    if network is None or (default is None and not agents):
+        return (), ()
+    if not agents:
+        return (default,) if default else (), (0,) * network.agents
+    if len(agents) != network.agents:
+        check.note("agent", f"one [[agent]] table for each of the {network.agents} agents", f"{len(agents)}")
+        return (), ()
+    different: dict[tuple[Any, ...], int] = {}
+    sensors, sensor_of = [], []
+    for i, table in enumerate(agents, start=1):
+        path, table = f"agent[{i}]", table if isinstance(table, dict) else {}
+        size = filters[i - 1].dimension if filters else d
+        if table.get("sensor") is False:
+            sensor = Sensor(np.zeros((0, size or 1)), np.zeros((0, 0)))
+            for key in {"H", "R"} & set(table):
+                check.note(f"{path}.{key}", "nothing, since sensor = false", shown(table[key]))
+        else:
+            # the model's sensor is for filters that have as many states as the model
+            fitting = default if default is None or default.H.shape[-1] == size else None
+            for key in ("H", "R"):
+                if fitting is None and key not in table:
+                    check.note(f"{path}.{key}", "a sensor of its own, or sensor = false", "nothing")
+            sensor = _sensor(check, path, table, size, network.steps, fitting)
+        if sensor is None:
+            continue
+        key = (sensor.H.shape, sensor.H.tobytes(), sensor.R.shape, sensor.R.tobytes())
+        if key not in different:
+            different[key] = len(sensors)
+            sensors.append(sensor)
+        sensor_of.append(different[key])
+    return tuple(sensors), tuple(sensor_of)
+
+
+def read_filters(
+    check: Checker, agents: Any, model: Model | None, P0: np.ndarray | None, own: bool, network: Network | None
+) -> tuple[Filter, ...]:
+    """Read the agents' own filters from [[agent]]; none where all have the model's."""
+    tables = [table if isinstance(table, dict) else {} for table in agents or []]
+    keys = ("F", "Q", "P") if own else ("F", "Q", "P", "M", "s")
+    if model is None or P0 is None or network is None:
+        return ()
+    for i, table in enumerate(tables, start=1):
+        for key in ("M", "s"):
+            if own and key in table:
+                check.note(f"agent[{i}].{key}", "nothing, since every agent has a state of its own", shown(table[key]))
+    if not any(key in table for table in tables for key in keys):
+        return ()
+    size = model.dimension if own else None
+    found = [
+        _filter(check, f"agent[{i}]", table, model, P0, network.steps, size) for i, table in enumerate(tables, start=1)
+    ]
+    filters = tuple(f for f in found if f is not None)
+    return filters if len(filters) == len(found) else ()
+
+
+def _filter(
+    check: Checker, path: str, table: Mapping[str, Any], model: Model, P0: np.ndarray, steps: int, size: int | None
+) -> Filter | None:
+    F = check.matrix(f"{path}.F", table.get("F"), size, size, steps) if "F" in table else model.F
+    if F is None or F.shape[-1] != F.shape[-2]:
+        if F is not None:
+            check.note(f"{path}.F", "a square matrix", f"a {F.shape[-2]}×{F.shape[-1]} matrix")
+        return None
+    d, D = F.shape[-1], model.dimension
+    Q = _own(check, f"{path}.Q", table.get("Q"), d, steps, model.Q if d == D else None)
+    P = _own(check, f"{path}.P", table.get("P"), d, 0, P0 if d == D else None)
+    M = check.matrix(f"{path}.M", table.get("M"), D, d, 0) if "M" in table else np.eye(D) if d == D else None
+    s = check.vector(f"{path}.s", table.get("s"), D)
+    if M is None and "M" not in table:
+        check.note(f"{path}.M", f"a {D}×{d} mapping into the state, since the filter has {d} states", "nothing")
+    if Q is None or P is None or M is None:
+        return None
+    return Filter(F, Q, P, M, np.zeros((D, 1)) if s is None else s)
+
+
+def _own(check: Checker, path: str, value: Any, d: int, steps: int, default: np.ndarray | None) -> np.ndarray | None:
+    if value is not None:
+        return check.covariance(path, value, d, steps)
+    if default is None:
+        check.note(path, f"a {d}×{d} covariance, to go with its own F", "nothing")
+    return default
+
+
+def read_noise(
+    check: Checker, table: Mapping[str, Any], sensors: Sequence[Sensor], filters: Sequence[Filter], own: bool
+) -> tuple[Noise | None, np.ndarray | None]:
+    """Read [noise]: measurement noises that hang together, and the process noise of all parallel filters."""
+    process = None
+    if table.get("process") is not None:
+        process = check.covariance("noise.process", table["process"], sum(f.dimension for f in filters) or None, 0)
+        if own or not filters:
+            check.note("noise.process", "nothing unless agents have parallel filters ([[agent]] F, Q, M)", "a matrix")
+        elif process is not None:
+            _check_blocks(check, process, [f.Q for f in filters])
+    if table.get("correlation") is None and table.get("disturbance") is None:
+        return None, process
+    sizes = [sensor.H.shape[-2] for sensor in sensors]
+    correlation = _correlation(check, table.get("correlation"), sizes)
+    disturbance = _disturbance(check, table.get("disturbance"), sizes)
+    return (None if correlation is None else Noise(correlation, disturbance)), process
+
+
+def _check_blocks(check: Checker, process: np.ndarray, own: Sequence[np.ndarray]) -> None:
+    first = 0
+    for i, Q in enumerate(own, start=1):
+        rows = slice(first, first + Q.shape[-1])
+        first = rows.stop
+        if not np.allclose(process[rows, rows], Q, rtol=1e-9, atol=0):
+            check.note("noise.process", f"the process noise of agent {i}'s own filter as its diagonal block", "another")
+
+
+def _correlation(check: Checker, value: Any, sizes: Sequence[int]) -> np.ndarray | None:
+    n = len(sizes)
+    expected = f"a number, or a symmetric {n}×{n} matrix of correlations with 1 on its diagonal"
+    c = check.array("noise.correlation", 0.0 if value is None else value, expected)
+    if c is None:
+        return None
+    if c.ndim == 0:
+        c = np.where(np.eye(n, dtype=bool), 1.0, c)
+    if c.shape != (n, n) or not np.allclose(c, c.T) or not np.allclose(np.diagonal(c), 1.0):
+        check.note("noise.correlation", expected, shown(value))
+        return None
+    sees = [i for i in range(n) if sizes[i]]
+    smallest = float(np.linalg.eigvalsh(c[np.ix_(sees, sees)]).min()) if sees else 1.0
+    if smallest < -1e-9 or np.abs(c).max() > 1:
+        kind = "correlations that can be (a positive semi-definite matrix)"
+        check.note("noise.correlation", kind, f"{shown(value)} (smallest eigenvalue {smallest:.3g})")
+        return None
+    unlike = [(i, j) for i in sees for j in sees if c[i, j] and sizes[i] != sizes[j]]
+    if unlike:
+        i, j = unlike[0]
+        got = f"{sizes[i]} of agent {i + 1} and {sizes[j]} of agent {j + 1}"
+        check.note("noise.correlation", "sensors with as many components where they are correlated", got)
+        return None
+    return c
+
+
+def _disturbance(check: Checker, value: Any, sizes: Sequence[int]) -> np.ndarray | None:
+    total, expected = sum(sizes), "a variance, one sensor's variances, or a matrix over all components"
+    array = check.array("noise.disturbance", value, expected)
+    if array is None:
+        return None
+    if array.ndim == 1:
+        if any(size not in (0, len(array)) for size in sizes):
+            check.note("noise.disturbance", f"{max(sizes)} variances, one for each component", f"{len(array)}")
+            return None
+        array = np.diag(np.concatenate([array[:size] for size in sizes]))
+    return check.covariance("noise.disturbance", array, total, 0)

@@ -1,0 +1,314 @@
+"""The finished file of a study, read in blocks of points.
+
+The answers of a study as a file: one row per point and step, with every key and every quantity.
+
+    point     number of the point, from 0
+    …         the varied keys, by their names; matrices and the like as JSON
+    method, estimator, nature     how it was predicted; nature is exact, approximate, bound or sampled, of several
+              quantities that of the least certain
+    step      number of the step, from 1; empty where the point failed
+    …         value columns, "claimed.trace"; empty where the point failed
+    error     why the point failed, else empty
+
+A Parquet file has one row group per chunk of points, and in its metadata the labels of the columns and the study.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stochfuse.errors import UsageError
+from stochfuse.studies.evaluation import Answers
+from stochfuse.studies.plan import Plan
+
+LINES = 100_000
+"""Lines of a CSV file that are held at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Results:
+    """A finished study.
+
+    Parameters
+    ----------
+    plan : what was asked.
+    path : the file.
+    rows, failed : numbers of rows and of failed points.
+    first_errors : number and reason of the first points that failed.
+    """
+
+    plan: Plan
+    path: Path
+    rows: int
+    failed: int
+    first_errors: tuple[tuple[int, str], ...]
+
+    def blocks(self, columns: Sequence[str], step: int | None = None) -> Iterator[dict[str, np.ndarray]]:
+        """Columns of successive points at a step (default: each point's last), without the points that failed.
+
+        Raises
+        ------
+        UsageError
+            If there is no such column.
+        """
+        for rows in self._whole_points(columns):
+            fine = rows["step"] > 0
+            point = rows["point"]
+            last = np.append(point[1:] != point[:-1], True) if step is None else rows["step"] == step
+            yield {name: rows[name][fine & last] for name in columns}
+
+    def mean_over_steps(self, column: str) -> Iterator[np.ndarray]:
+        """Mean of a value column over all steps of a point, block by block as `blocks` has them."""
+        for rows in self._whole_points([column]):
+            fine = rows["step"] > 0
+            _, place = np.unique(rows["point"][fine], return_inverse=True)
+            counts = np.bincount(place)
+            yield np.bincount(place, weights=rows[column][fine]) / np.maximum(counts, 1)
+
+    def _whole_points(self, columns: Sequence[str]) -> Iterator[dict[str, np.ndarray]]:
+        wanted = list(dict.fromkeys([*columns, "point", "step"]))
+        read = _parquet if self.path.suffix.lower() == ".parquet" else _csv
+        known = {axis.name for axis in self.plan.axes} | {"point", "step", "method", "estimator", "nature", "error"}
+        for name in wanted:
+            if name not in known and name not in self.plan.columns:
+                raise UsageError(f"no column '{name}': the value columns are {', '.join(self.plan.columns)}")
+        return read(self.path, wanted, self.plan)
+
+
+def _parquet(path: Path, columns: Sequence[str], plan: Plan) -> Iterator[dict[str, np.ndarray]]:
+    import pyarrow.parquet as pq
+
+    with pq.ParquetFile(path) as file:
+        for group in range(file.num_row_groups):
+            table = file.read_row_group(group, columns=list(columns))
+            yield {name: _column(table[name]) for name in columns}
+
+
+def _column(column: Any) -> np.ndarray:
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    if pa.types.is_dictionary(column.type):
+        return np.array(column.to_pylist(), dtype=object)
+    if pa.types.is_integer(column.type):
+        return pc.fill_null(column, 0).to_numpy()
+    return column.to_numpy()
+
+
+def _csv(path: Path, columns: Sequence[str], plan: Plan) -> Iterator[dict[str, np.ndarray]]:
+    kinds = {axis.name: axis.kind for axis in plan.axes} | dict.fromkeys(plan.columns, "float")
+    kinds |= {"point": "int", "step": "int"}
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.reader(file)
+        header = next(reader)
+        places, point = [header.index(name) for name in columns], header.index("point")
+        held: list[list[str]] = []
+        while lines := list(islice(reader, LINES)):
+            held += lines
+            # the last point may go on in the next lines
+            last = next(i for i in range(len(held) - 1, -1, -1) if i == 0 or held[i - 1][point] != held[-1][point])
+            if last:
+                yield _parsed(held[:last], places, columns, kinds)
+                held = held[last:]
+        if held:
+            yield _parsed(held, places, columns, kinds)
+
+
+def _parsed(
+    lines: list[list[str]], places: Sequence[int], columns: Sequence[str], kinds: dict[str, str]
+) -> dict[str, np.ndarray]:
+    found = {}
+    for place, name in zip(places, columns, strict=True):
+        cells = [line[place] for line in lines]
+        kind = kinds.get(name, "text")
+        if kind == "int":
+            found[name] = np.array([int(cell or 0) for cell in cells])
+        elif kind == "float":
+            found[name] = np.array([float(cell or "nan") for cell in cells])
+        else:
+            found[name] = np.array([cell or None for cell in cells], dtype=object)
+    return found
+
+
+FORMATS = (".parquet", ".csv")
+NO_PARQUET = "Parquet files need pyarrow: pip install 'stochfuse[study]', or name an --output that ends in .csv"
+FIRST_ERRORS = 5
+
+
+def packed(answers: Answers) -> bytes:
+    """Return answers as bytes."""
+    file = io.BytesIO()
+    words = json.dumps([answers.kinds, list(answers.errors.items())]).encode()
+    np.savez(
+        file,
+        allow_pickle=False,
+        steps=answers.steps,
+        values=answers.values,
+        what=answers.what,
+        words=np.frombuffer(words, dtype=np.uint8),
+    )
+    return file.getvalue()
+
+
+def unpacked(data: bytes) -> Answers:
+    """Return the answers that bytes stand for."""
+    with np.load(io.BytesIO(data), allow_pickle=False) as file:
+        kinds, errors = json.loads(file["words"].tobytes())
+        return Answers(file["steps"], file["values"], file["what"], tuple(map(tuple, kinds)), dict(errors))
+
+
+def check_format(path: Path) -> None:
+    """Raise UsageError unless files of such a name can be written here."""
+    if path.suffix.lower() not in FORMATS:
+        raise UsageError(f"--output {path}: expected a name that ends in {' or '.join(FORMATS)}")
+    if path.suffix.lower() == ".parquet":
+        try:
+            import pyarrow.parquet  # noqa: F401
+        except ImportError:
+            raise UsageError(NO_PARQUET) from None
+
+
+class Columns:
+    """The columns of a plan's file, chunk by chunk."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan = plan
+        keys = [axis.name for axis in plan.axes]
+        self.kinds = [name for name in ("method", "estimator", "nature") if name not in keys]
+        self.names = ("point", *keys, *self.kinds, "step", *plan.columns, "error")
+
+    def of(self, points: range, answers: Answers) -> dict[str, tuple[np.ndarray, Any]]:
+        """Columns of some points: values, and of words the codes and the words that they stand for."""
+        rows = answers.rows
+        first = np.concatenate([[0], np.cumsum(rows)])[:-1]
+        failed = np.repeat(answers.steps == 0, rows)
+        found: dict[str, tuple[np.ndarray, Any]] = {"point": (np.repeat(np.array(points), rows), None)}
+        for axis, codes in zip(self.plan.axes, self.plan.codes(points).values(), strict=True):
+            words = axis.column if axis.kind == "text" else None
+            found[axis.name] = (np.repeat(codes if words is not None else axis.shown(codes), rows), words)
+        for place, name in enumerate(("method", "estimator", "nature")):
+            if name in self.kinds:
+                words = [kind[place] for kind in answers.kinds]
+                unsaid = np.array([not word for word in words])[answers.what]
+                found[name] = (np.ma.array(np.repeat(answers.what, rows), mask=np.repeat(unsaid, rows)), words)
+        step = np.arange(1, len(failed) + 1) - np.repeat(first, rows)
+        found["step"] = (np.ma.array(step, mask=failed), None)
+        for place, name in enumerate(self.plan.columns):
+            value = answers.values[:, place]
+            found[name] = (np.ma.array(value, mask=np.isnan(value)), None)
+        reasons = list(dict.fromkeys(answers.errors.values()))
+        place_of = {reason: place for place, reason in enumerate(reasons)}
+        codes = np.zeros(len(failed), dtype=np.int32)
+        for point, reason in answers.errors.items():
+            codes[first[point - points.start]] = place_of[reason]
+        found["error"] = (np.ma.array(codes, mask=~failed), reasons or [""])
+        return found
+
+
+def write_result(
+    plan: Plan, answers: Iterator[tuple[range, Answers]], path: Path, told: Callable[[int], None] = lambda points: None
+) -> dict[str, Any]:
+    """Write all answers of a plan, in their order, as Parquet or CSV by the file's name.
+
+    Parameters
+    ----------
+    answers : points and their answers.
+    told : told how many points are written.
+
+    Returns
+    -------
+    dict
+        Numbers of points, rows and failed points, and the first reasons.
+    """
+    columns, rows, failed = Columns(plan), 0, 0
+    first: list[tuple[int, str]] = []
+    with (_Parquet if path.suffix.lower() == ".parquet" else _Csv)(path, columns) as file:
+        for points, found in answers:
+            file.write(columns.of(points, found))
+            rows, failed = rows + int(found.rows.sum()), failed + len(found.errors)
+            first += list(found.errors.items())[: FIRST_ERRORS - len(first)]
+            told(points.stop)
+    return {"points": plan.size, "rows": rows, "failed": failed, "first_errors": first}
+
+
+class _Parquet:
+    """A Parquet file that is being written."""
+
+    def __init__(self, path: Path, columns: Columns) -> None:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        self.pa, plan = pa, columns.plan
+        words = pa.dictionary(pa.int32(), pa.string())
+        kinds = {"int": pa.int64(), "float": pa.float64(), "text": words}
+        types: dict[str, Any] = {"point": pa.int64(), "step": pa.int32(), "error": words}
+        types |= {axis.name: kinds[axis.kind] for axis in plan.axes}
+        types |= dict.fromkeys(columns.kinds, words) | dict.fromkeys(plan.columns, pa.float64())
+        fields = [pa.field(n, types[n], metadata=_label(plan.labels, n)) for n in columns.names]
+        about = {"stochfuse.study": json.dumps(plan.record)}
+        self.schema = pa.schema(fields, metadata=about)
+        text: Any = [name for name in columns.names if types[name] == words]
+        self.file = pq.ParquetWriter(path, self.schema, use_dictionary=text, compression="zstd")
+
+    def __enter__(self) -> _Parquet:
+        return self
+
+    def __exit__(self, *reason: Any) -> None:
+        self.file.close()
+
+    def write(self, columns: Mapping[str, tuple[np.ndarray, Any]]) -> None:
+        """Write one row group."""
+        self.file.write_table(self.pa.table(list(map(self._array, columns.values())), schema=self.schema))
+
+    def _array(self, column: tuple[np.ndarray, Any]) -> Any:
+        values, words = column
+        mask = np.ma.getmaskarray(values) if isinstance(values, np.ma.MaskedArray) else None
+        plain = np.ma.getdata(values)
+        if words is None:
+            kind = self.pa.int32() if mask is not None and plain.dtype.kind == "i" else None
+            return self.pa.array(plain, mask=mask, type=kind)
+        codes = self.pa.array(plain.astype(np.int32), mask=mask)
+        return self.pa.DictionaryArray.from_arrays(codes, self.pa.array(words, type=self.pa.string()))
+
+
+def _label(labels: Mapping[str, str], name: str) -> dict[str, str] | None:
+    return {"label": labels[name]} if name in labels else None
+
+
+class _Csv:
+    """A CSV file that is being written."""
+
+    def __init__(self, path: Path, columns: Columns) -> None:
+        self.path, self.names = path, columns.names
+
+    def __enter__(self) -> _Csv:
+        self.file = self.path.open("w", newline="", encoding="utf-8")
+        self.writer = csv.writer(self.file, lineterminator="\n")
+        try:
+            self.writer.writerow(self.names)
+        except BaseException:
+            self.file.close()
+            raise
+        return self
+
+    def __exit__(self, *reason: Any) -> None:
+        self.file.close()
+
+    def write(self, columns: Mapping[str, tuple[np.ndarray, Any]]) -> None:
+        """Write rows."""
+        self.writer.writerows(zip(*map(_cells, columns.values()), strict=True))
+
+
+def _cells(column: tuple[np.ndarray, Any]) -> list[Any]:
+    values, words = column
+    cells = values.tolist()  # None where masked
+    return cells if words is None else [None if cell is None else words[cell] for cell in cells]

@@ -1,0 +1,10 @@
+"""What the thesis found, found here: every figure and table of its chapters 3 and 4, and the run time it measured."""
+
+from stochfuse.thesis.bench import Bench as Bench
+from stochfuse.thesis.catalogue import catalogue as catalogue
+from stochfuse.thesis.catalogue import find as find
+from stochfuse.thesis.catalogue import listing as listing
+from stochfuse.thesis.catalogue import page as page
+from stochfuse.thesis.catalogue import sheet as sheet
+from stochfuse.thesis.runtime import Timing as Timing
+from stochfuse.thesis.runtime import timing as timing

@@ -1,0 +1,398 @@
+"""Records of truth and measurements: one world that the thesis holds fixed while it draws links.
+
+A record is a vector s of the independent noises in units of their own deviations, as `stochfuse.estimators.world`
+orders them:
+the agents' initial errors, then for every step 2 … K the process noise and the agents' measurement noises; and 1 for
+the known initial error.  Two things that the thesis leaves unsaid can be varied:
+
+    "own"      every agent draws its own initial estimate and its own measurements
+    "start"    one initial estimate for all agents (fused as if each had its own)
+    "all"      one initial estimate and one measurement of each step for all agents
+
+The numbers behind the thesis' figures, each calculated once: claimed covariances, error weights, message loads.
+
+Every estimate here is linear in independent noises.  In one outcome of "which messages arrive" its error is x·s, where
+s holds the noises in units of their own deviations (and a last entry 1 for the known initial error) and x is the
+estimate's noise footprint (theory section 7).  Averaged over the outcomes,
+
+    E[error]  = E[x]·s          E[error²] = sᵀ E[x xᵀ] s
+
+for one record s of truth and measurements, which is what the thesis averages (it keeps one record for all its runs),
+and with E over s as well, the average over noise.  E[x] and E[x xᵀ] are exact: every outcome is gone through.
+
+The simplified formulation (53) has one estimate instead of outcomes; its footprint is read off `predict_states` by
+giving it unit data, each agent with data of its own.  Its initial estimates are taken as independent, as in (54): of
+those at step 1 an agent weighs its own with E[1/(m+1)] and each other one with an equal share of the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from stochfuse.engines.enumeration import Ending, claimed
+from stochfuse.engines.events import bernstein, relabellings
+from stochfuse.engines.progress import Progress
+from stochfuse.prediction.general import Outcomes, outcomes
+from stochfuse.prediction.predict import predict
+from stochfuse.prediction.states import predict_states
+from stochfuse.questions.messages import MessageLoad, message_load
+from stochfuse.scenario.scenario import Scenario, link_rows, load_scenario
+
+WINDOWS = ((6, 10), (6, 12))
+"""Steps that the thesis states, and those that its maxima need."""
+TABLE_3 = {
+    "ad-hoc": ((0.0, 0, 0.0), (1.820, 22, 2.843), (1.992, 16, 1.974), (1.988, 8, 1.146), (2.0, 2, 0.0)),
+    "broadcast": ((0.0, 0, 0.0), (1.823, 24, 2.896), (1.991, 18, 1.970), (1.982, 9, 1.154), (2.0, 2, 0.0)),
+    "cyclic": ((0.0, 0, 0.0), (1.491, 23, 3.432), (1.858, 21, 2.766), (1.943, 11, 1.694), (2.0, 2, 0.0)),
+}
+"""Mean, maximum and standard deviation at µ = 0, 0.25, 0.5, 0.75, 1: thesis table 3, 3 agents, 1000 runs."""
+
+
+class Moments(NamedTuple):
+    """Mean, largest and standard deviation of a load in nodes."""
+
+    mean: float
+    maximum: int
+    std: float
+
+
+class Row(NamedTuple):
+    """One entry of table 3 beside ours.
+
+    Parameters
+    ----------
+    column : the thesis' heading: "ad-hoc", "broadcast" or "cyclic".
+    link : µ.
+    thesis : its moments; the maximum is that of 1000 runs.
+    ours : by (architecture, first step, last step), exact; the maximum is the largest that is possible.
+    """
+
+    column: str
+    link: float
+    thesis: Moments
+    ours: dict[tuple[str, int, int], Moments]
+
+
+def table_3_rows() -> tuple[Row, ...]:
+    """Return table 3 of the thesis and what the exact walk gives for it.
+
+    Beside its *ad hoc* column stand an ad hoc and a broadcast draw; the windows are `WINDOWS`.
+    """
+    link = np.linspace(0.0, 1.0, 5)
+    loads = {}
+    for architecture in TABLE_3:
+        whole = message_load(load_scenario(agents=3, steps=12, architecture=architecture, uniform_link=True), link)
+        for window in WINDOWS:
+            load = whole.between(*window)
+            moments = zip(load.mean().tolist(), load.maximum().tolist(), load.std().tolist(), strict=True)
+            loads[architecture, *window] = [Moments(*m) for m in moments]
+    return tuple(
+        Row(
+            column,
+            float(µ),
+            Moments(*thesis[i]),
+            {
+                key: moments[i]
+                for key, moments in loads.items()
+                if key[0] == column or (column, key[0]) == ("ad-hoc", "broadcast")
+            },
+        )
+        for column, thesis in TABLE_3.items()
+        for i, µ in enumerate(link)
+    )
+
+
+DATA = ("own", "start", "all")
+TRUTH = 1000.0
+"""True state at step 1, the mean of the thesis' x(0)."""
+
+
+def _shared(scenario: Scenario, data: str) -> np.ndarray:
+    """Index of the noise that each entry of s is."""
+    n, steps = scenario.network.agents, scenario.network.steps
+    index = np.arange(n + (steps - 1) * (n + 1) + 1)
+    if data != "own":
+        index[:n] = 0
+    if data == "all":
+        for first in range(n + 1, len(index) - 1, n + 1):
+            index[first : first + n] = first
+    return index
+
+
+def spread(scenario: Scenario, data: str = "own", *, initial_error: bool = True) -> np.ndarray:
+    """E[s sᵀ] over the noise, (noises, noises).
+
+    Parameters
+    ----------
+    initial_error : whether the known initial error is there.
+    """
+    index = _shared(scenario, data)
+    out = (index[:, None] == index[None, :]).astype(float)
+    out[-1, -1] = float(initial_error)
+    return out
+
+
+def draw(scenario: Scenario, number: int, seed: int, data: str = "own") -> np.ndarray:
+    """Return some records s, (records, noises); the first ones are the same whatever their number."""
+    index = _shared(scenario, data)
+    made = [np.random.default_rng([seed, i]).standard_normal(len(index)) for i in range(number)]
+    out = np.stack(made)[:, index]
+    out[:, -1] = 1.0
+    return out
+
+
+def truth(scenario: Scenario, records: np.ndarray) -> np.ndarray:
+    """True state of some records, (records, steps)."""
+    n, steps = scenario.network.agents, scenario.network.steps
+    moves = records[:, n : -1 : n + 1] * np.sqrt(scenario.model.Q.item())
+    return TRUTH + np.concatenate([np.zeros((len(records), 1)), np.cumsum(moves, axis=1)], axis=1)[:, :steps]
+
+
+LINKS = (0.0, 0.25, 0.5, 0.75, 1.0)
+ARCHITECTURES = ("ad-hoc", "broadcast", "cyclic")
+LFG, NAIVE, SIMPLIFIED = "local-fusion-graph", "naive", "simplified"
+STATED_WINDOW, WINDOW = WINDOWS
+"""Steps over which message loads are averaged: as the thesis says, and as the maxima of its table 3 need."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scenario of the thesis: a preset, with other noises where a figure asks for them.
+
+    Parameters
+    ----------
+    name : "transient" or "steady".
+    q, r : variances of process and measurement noise; default: those of the preset.
+    """
+
+    name: str
+    q: float | None = None
+    r: float | None = None
+
+
+TRANSIENT, STEADY = Case("transient"), Case("steady")
+
+
+class Averages(NamedTuple):
+    """What is averaged over the outcomes at a step, as coefficients A_c of Σ A_c µ^c (1−µ)^(L−c).
+
+    Parameters
+    ----------
+    P : (L + 1,) claimed covariance.
+    first : (L + 1, noises) E[x]; no noises where errors are not wanted.
+    second : (L + 1, noises, noises) E[x xᵀ].
+    extremes : smallest and largest claimed covariance of any outcome.
+    """
+
+    P: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+    extremes: tuple[float, float]
+
+    def symmetric(self, turns: Sequence[np.ndarray]) -> Averages:
+        """Return the same averaged over the orders of the noises that relabellings of the agents make.
+
+        Outcomes that differ by a relabelling are gone through once, whoever is called what; for one record, where the
+        agents' noises are different numbers, each of them counts.
+        """
+        if not self.first.shape[1]:
+            return self
+        first = np.mean([self.first[:, turn] for turn in turns], axis=0)
+        second = np.mean([self.second[:, turn[:, None], turn] for turn in turns], axis=0)
+        return self._replace(first=first, second=second)
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """Moments of the noise footprint over the outcomes, averaged over the agents.
+
+    Parameters
+    ----------
+    first : (links, steps, noises) E[x].
+    second : (links, steps, noises, noises) E[x xᵀ].
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+
+    def rms(self, spread: np.ndarray) -> np.ndarray:
+        """RMS error averaged over the noise, (links, steps), with E[s sᵀ] = spread of shape (noises, noises)."""
+        return np.sqrt((self.second * spread).sum(axis=(-2, -1)))
+
+    def rms_given(self, records: np.ndarray) -> np.ndarray:
+        """RMS error over the outcomes for records s of shape (records, noises), (records, links, steps)."""
+        square = np.einsum("ri,lkij,rj->rlk", records, self.second, records, optimize=True)
+        return np.sqrt(np.maximum(square, 0.0))
+
+    def mean_given(self, records: np.ndarray) -> np.ndarray:
+        """Mean error over the outcomes for records s, (records, links, steps)."""
+        return np.einsum("ri,lki->rlk", records, self.first)
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """What the figures are made from; remembers what it has calculated.
+
+    Parameters
+    ----------
+    steps : number of time steps, 5 in the thesis.
+    seed : of the records of truth and measurements.
+    progress : told how far long work is.
+    """
+
+    steps: int = 5
+    seed: int = 1
+    progress: Progress | None = None
+    known: dict[Any, Any] = field(default_factory=dict, repr=False)
+
+    def once(self, key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
+        """Return what was made for a key, made now if it was not."""
+        if key not in self.known:
+            self.known[key] = make()
+        return self.known[key]
+
+    def scenario(self, case: Case, architecture: str) -> Scenario:
+        """Return a scenario of the thesis.  P(k0) of the transient one is R, as its table 2 has it."""
+        p0 = case.r if case.name == "transient" else None
+        return load_scenario(
+            f"thesis-{case.name}", architecture=architecture, steps=self.steps, q=case.q, r=case.r, p0=p0
+        )
+
+    def averages(self, case: Case, architecture: str, rule: str = LFG, *, errors: bool = True) -> list[Averages]:
+        """What is averaged over the outcomes, per step; perhaps without footprints, where errors are not wanted."""
+
+        def make() -> list[Averages]:
+            scenario = self.scenario(case, architecture)
+            # other networks take no time that is worth a word
+            told = self.progress if architecture == "ad-hoc" else None
+            found = outcomes(scenario, link_rows(scenario, LINKS), rule, errors=errors, progress=told)
+            turns = [noise_order(p, self.steps) for p in relabellings(scenario.network, found.rows, scenario.sensor_of)]
+            return [_averages(found, ending).symmetric(turns) for ending in found.structure.endings]
+
+        key = ("averages", case, architecture, rule)
+        return self.known.get((*key, True)) or self.once((*key, errors), make)
+
+    def extremes(self, case: Case, architecture: str, rule: str = LFG) -> np.ndarray:
+        """Smallest and largest covariance claimed in any outcome that links of 0 < µ < 1 allow, (steps, 2)."""
+        return np.array([step.extremes for step in self.averages(case, architecture, rule, errors=False)])
+
+    def claimed(self, case: Case, architecture: str, links: Sequence[float] = LINKS, rule: str = LFG) -> np.ndarray:
+        """Expected claimed covariance, (links, steps): exact, or approximate by (54) for the simplified rule."""
+        if rule == SIMPLIFIED:
+            return predict(self.scenario(case, architecture), list(links), method="simplified").values()
+        found = self.averages(case, architecture, rule, errors=False)
+        return np.stack([_at(step.P, links) for step in found], axis=1)
+
+    def weights(self, case: Case, architecture: str, links: Sequence[float] = LINKS, rule: str = LFG) -> Weights:
+        """Moments of the footprint at some link probabilities."""
+        return self.once(
+            ("weights", case, architecture, tuple(links), rule),
+            lambda: (
+                self._simplified_weights(case, architecture, links)
+                if rule == SIMPLIFIED
+                else self._weights(case, architecture, links, rule)
+            ),
+        )
+
+    def _weights(self, case: Case, architecture: str, links: Sequence[float], rule: str) -> Weights:
+        found = self.averages(case, architecture, rule)
+        first = np.stack([_at(step.first, links) for step in found], axis=1)
+        return Weights(first, np.stack([_at(step.second, links) for step in found], axis=1))
+
+    def _simplified_weights(self, case: Case, architecture: str, links: Sequence[float]) -> Weights:
+        scenario = self.scenario(case, architecture)
+        x = _simplified_footprint(scenario, links)
+        return Weights(x.mean(axis=2), np.einsum("lkai,lkaj->lkij", x, x) / scenario.network.agents)
+
+    def sample(self, case: Case, architecture: str, links: Sequence[float], runs: int) -> np.ndarray:
+        """Covariance that agent 1 claims in some sampled runs, (links, runs, steps)."""
+        found = predict(
+            self.scenario(case, architecture), list(links), method="monte-carlo", runs=runs, seed=self.seed
+        ).sampled
+        if found is None:
+            raise TypeError("a sample was asked for")
+        return found.sample.values.P[found.sample.which[..., 0]][..., 0, 0]
+
+    def messages(self, architecture: str, links: Sequence[float] = LINKS, rule: str = LFG) -> MessageLoad:
+        """Message load at steps 1 to 12."""
+
+        def make() -> MessageLoad:
+            scenario = load_scenario("thesis-transient", architecture=architecture, steps=max(*WINDOW, *STATED_WINDOW))
+            return message_load(scenario, list(links), rule)
+
+        return self.once(("messages", architecture, tuple(links), rule), make)
+
+
+def _averages(found: Outcomes, ending: Ending) -> Averages:
+    """Average a step over the outcomes, of which all agents are alike.
+
+    What `stochfuse.engines.enumeration.expectation` does, with the sum over the last exchange's outcomes inside a
+    product of matrices: the products of one outcome alone would fill the memory.
+    """
+    weights, least, most = found.weights, np.inf, 0.0
+    total: Any = 0.0
+    noises = 0
+    for view, states, estimate, _ in claimed(ending, found.values):
+        P = estimate.P[..., 0]
+        least, most = min(least, P.min()), max(most, P.max())
+        parts = [np.add.reduceat(P, view.starts, axis=1)]
+        if estimate.x is not None:
+            noises = estimate.x.shape[-1]
+            x = estimate.x[..., 0, :]
+            parts.append(np.add.reduceat(x, view.starts, axis=1))
+            products = [np.swapaxes(part, 1, 2) @ part for part in np.split(x, view.starts[1:], axis=1)]
+            parts.append(np.stack(products, axis=1).reshape(*parts[0].shape[:2], -1))
+        by_factor = weights.total(ending.weights[states], view.factors, np.concatenate(parts, axis=2))
+        total = total + weights.completed(weights.weighed(by_factor, view.shares[0]), ending.events)
+    P, first, products = np.split(total, [1, 1 + noises], axis=1)
+    return Averages(P[:, 0], first, products.reshape(len(total), noises, noises), (float(least), float(most)))
+
+
+def noise_order(agents: Sequence[int], steps: int) -> np.ndarray:
+    """Places of the noises when agents change places: place p is taken by agents[p]."""
+    n = len(agents)
+    order = np.arange(n + (steps - 1) * (n + 1) + 1)
+    for first in (0, *range(n + 1, len(order) - 1, n + 1)):
+        order[first : first + n] = first + np.asarray(agents)
+    return order
+
+
+def _at(coefficients: np.ndarray, links: Sequence[float]) -> np.ndarray:
+    """Value of Σ A_c µ^c (1−µ)^(L−c) at some link probabilities, (links, …)."""
+    return bernstein(coefficients, len(coefficients) - 1, np.asarray(links, dtype=float))
+
+
+def _simplified_footprint(scenario: Scenario, links: Sequence[float]) -> np.ndarray:
+    """Footprint of (53), (links, steps, agents, noises), columns as `stochfuse.estimators.world.error_sources` has
+    them.
+    """
+    n, steps = scenario.network.agents, scenario.network.steps
+    zeros = np.zeros((steps, n, 1))
+    one, none = replace(scenario, x0=np.ones((1, 1))), replace(scenario, x0=np.zeros((1, 1)))
+    links = list(links)
+    start = predict_states(one, zeros, links).x[..., 0]
+    P1 = predict(scenario, links, method="simplified").values()[:, 0]
+    own = P1 / scenario.P0.item()
+    noises = n + (steps - 1) * (n + 1) + 1
+    x = np.zeros((len(links), steps, n, noises))
+    deviation = np.sqrt([scenario.P0.item(), scenario.model.Q.item(), scenario.sensors[0].R.item()])
+    for i in range(n):
+        for j in range(n):
+            share = own if i == j else (1.0 - own) / (n - 1)
+            x[:, :, i, j] = deviation[0] * start[:, :, i] * share[:, None]
+    before = start.copy()  # weight of everything that knew the truth before a step
+    for t in range(1, steps):
+        place = n + (t - 1) * (n + 1)
+        x[:, t:, :, place] = -deviation[1] * before[:, t:]
+        for j in range(n):
+            unit = zeros.copy()
+            unit[t, j] = 1.0
+            weight = predict_states(none, unit, links).x[..., 0]
+            x[..., place + 1 + j] = deviation[2] * weight
+            before = before + weight
+    x[..., -1] = start * (0.0 if scenario.error is None else scenario.error.item())
+    return x
