@@ -151,7 +151,8 @@ def _names(text: str) -> list[str]:
 
 
 def _known(estimator: str) -> str:
-    from stochfuse.prediction.predict import ESTIMATORS, choose
+    from stochfuse.prediction.predict import choose
+    from stochfuse.scenario.registry import ESTIMATORS
 
     choose("estimator", estimator, ESTIMATORS)
     return estimator

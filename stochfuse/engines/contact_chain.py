@@ -87,7 +87,7 @@ class Contacts:
 
     held: np.ndarray
     starts: tuple[int, ...]
-    transition: Callable[[int, slice], np.ndarray]
+    transition: Callable[[int, slice | np.ndarray], np.ndarray]
     constant: bool
 
 
@@ -131,7 +131,7 @@ def _of_counts(network: Network, rows: LinkRows, oldest: int) -> Contacts:
         for state in states
     ]
 
-    def transition(step: int, some: slice) -> np.ndarray:
+    def transition(step: int, some: slice | np.ndarray) -> np.ndarray:
         µ = rows.at_step(step)
         success = by_age(network, µ, rows.chain(µ), oldest)[some]
         T = np.zeros((len(success), len(states), len(states)))
@@ -210,7 +210,7 @@ def _of_sets(
         found = grown
     targets = [np.searchsorted(found, t) for t in new]
 
-    def transition(step: int, some: slice) -> np.ndarray:
+    def transition(step: int, some: slice | np.ndarray) -> np.ndarray:
         drawn = events(network, rows, step)
         success = [by_age(network, e.probability, e.burst, oldest)[some] for e in drawn]
         T = np.zeros((len(rows.link[some]), len(found), len(found)))
@@ -354,7 +354,7 @@ class Chain(NamedTuple):
     square : (rows, steps, groups, d, d) E[P + b bᵀ], or None.
     bound : (rows, steps) relative half-width of the enclosure; 0 where every path was gone through.
     paths : number of paths gone through, or None.
-    rounding : how far rounding may reach in the covariance, relative to the standard deviations.
+    rounding : (rows,) how far rounding may reach in the covariance, relative to the standard deviations.
     """
 
     P: np.ndarray
@@ -362,7 +362,7 @@ class Chain(NamedTuple):
     square: np.ndarray | None
     bound: np.ndarray
     paths: int | None
-    rounding: float = 0.0
+    rounding: np.ndarray | float = 0.0
 
 
 class TooManyPathsError(UsageError):
@@ -388,7 +388,7 @@ def blocks_of_rows(contacts: Contacts, rows: int) -> Iterator[slice]:
     return (slice(first, min(first + size, rows)) for first in range(0, rows, size))
 
 
-def transitions(contacts: Contacts, steps: int, some: slice) -> Iterator[np.ndarray]:
+def transitions(contacts: Contacts, steps: int, some: slice | np.ndarray) -> Iterator[np.ndarray]:
     """T of every step in turn."""
     T = contacts.transition(1, some)
     for step in range(1, steps + 1):
@@ -437,7 +437,7 @@ def joined(found: Sequence[tuple[list[np.ndarray], int]]) -> Chain:
     return Chain(P, b, M, np.zeros(P.shape[:2]), found[0][1])
 
 
-def over_paths(given: Filter, contacts: Contacts, steps: int, some: slice) -> tuple[list[np.ndarray], int]:
+def over_paths(given: Filter, contacts: Contacts, steps: int, some: slice | np.ndarray) -> tuple[list[np.ndarray], int]:
     """E[P], E[b] and E[P + b bᵀ] of some rows, each (rows, steps, groups, …), and the number of paths.
 
     Parameters

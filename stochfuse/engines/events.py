@@ -184,15 +184,13 @@ class _Polynomial(_Memoryless):
         """Weights of two independent parts together."""
         return np.convolve(a, b)
 
-    def total(self, states: np.ndarray, cells: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Σ states · cells · values over states and groups of cells, shape (degrees + 1, …)."""
-        flat = values.reshape(*values.shape[:2], -1)
-        first = np.tensordot(states.T, flat, axes=1)
-        pairs = np.einsum("hm,chv->cmv", cells, first)
-        out = np.zeros((sum(pairs.shape[:2]) - 1, pairs.shape[2]))
-        for c, row in enumerate(pairs):
-            out[c : c + len(row)] += row
-        return out.reshape(-1, *values.shape[2:])
+    def pairs(self, states: np.ndarray, factors: np.ndarray) -> np.ndarray:
+        """Weights of every state with every factor, (states, factors, width)."""
+        width = states.shape[1] + factors.shape[1] - 1
+        out = np.zeros((len(states), len(factors), width))
+        for c, column in enumerate(factors.T):
+            out[:, :, c : c + states.shape[1]] += states[:, None] * column[:, None]
+        return out
 
     def weighed(self, total: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """Σ_c total times an independent part's weight."""
@@ -308,10 +306,9 @@ class Rows(_Memoryless):
 
     factors = table
 
-    def total(self, states: np.ndarray, cells: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Σ states · cells · values over states and groups of cells, shape (rows, …)."""
-        flat = values.reshape(*values.shape[:2], -1)
-        return np.einsum("gr,hr,ghv->rv", states, cells, flat, optimize=True).reshape(-1, *values.shape[2:])
+    def pairs(self, states: np.ndarray, factors: np.ndarray) -> np.ndarray:
+        """Weights of every state with every factor, (states, factors, rows)."""
+        return states[:, None] * factors
 
     def weighed(self, total: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """Total times an independent part's weight."""
@@ -389,10 +386,8 @@ def bursty(drawn: Sequence[Event], rows: int) -> Bursty:
     return Bursty(rows << len(drawn), len(drawn), moves.reshape(len(drawn), rows, 2, 2))
 
 
-def weights_for(network: Network, rows: LinkRows, number_of_events: int) -> Weights:
-    """Return the cheapest exact bookkeeping: by number of successes where all µ are equal, else by row."""
-    if not rows.uniform or rows.varies:
-        return Rows(len(rows.link))
+def weights_for(network: Network, number_of_events: int) -> Weights:
+    """Return the cheapest exact bookkeeping by number of successes, where all µ are equal."""
     return Counts(number_of_events + 1) if network.delay == (1.0,) else Coefficients()
 
 

@@ -42,7 +42,8 @@ from stochfuse.kalman.kernel import (
     update_factor,
     update_information,
 )
-from stochfuse.scenario.model import Model, Noises, Sensor
+from stochfuse.scenario.model import Model, Sensor, varies
+from stochfuse.scenario.system import Noises
 
 CANCELLATION = 1e-5
 """Share of prior variance left by an update, below which the square-root form takes over: 1e-16/1e-5 of an entry."""
@@ -214,7 +215,7 @@ class _OwnNoises:
         model, sensor = self._case.model, self._case.sensor
         if self._C is None or model.dimension > 1:
             return _prior_map(model, sensor, step)[2]
-        if self._J is None or sensor.H.ndim > 2:
+        if self._J is None or varies(sensor.H):
             self._J = (solve_lower(self._C, at_step(sensor.H, step)[..., None]) ** 2).sum(axis=(0, 1))
         return self._J
 
@@ -319,7 +320,7 @@ class Outcomes:
     def advance(self, carried: Carried, step: int) -> Carried:
         F, Q = at_step(self.model.F, step), at_step(self.model.Q, step)
         prior = predict_factor(carried.value, F, factor(Q))
-        sensors = [Sensor(at_step(s.H, step), at_step(s.R, step)) for s in self.sensors]
+        sensors = [s.at(step) for s in self.sensors]
         nothing = Information(None, np.zeros_like(prior))
         gained = np.stack([update_information(nothing, s.H @ prior, s.R).Y for s in sensors])
         weights = self.weights[step - 1]

@@ -20,7 +20,7 @@ import numpy as np
 
 from stochfuse.engines.events import Event
 from stochfuse.engines.progress import uncollected
-from stochfuse.estimators.protocol import Claims, Estimator, Exchange, Late, Made
+from stochfuse.estimators.protocol import Claims, Estimator, Exchange, Late
 from stochfuse.kalman.kernel import Estimate
 
 BLOCK = 1000
@@ -39,7 +39,7 @@ class Experiment(NamedTuple):
     agents : number of agents.
     events : events of every step.
     delay : probabilities of 0, 1, 2 … steps of delay.
-    make : makes the estimator.
+    make : makes the estimator, and what to call for its numbers once all runs have been followed.
     of : makes what is kept of every estimate, a named tuple of arrays or Nones, of a stack of estimates.
     runs, seed : size of the sample per row, and its seed.
     """
@@ -47,7 +47,7 @@ class Experiment(NamedTuple):
     agents: int
     events: list[list[Event]]
     delay: tuple[float, ...]
-    make: Callable[[], Made]
+    make: Callable[[], tuple[Estimator, Callable[[], Claims]]]
     of: Callable[[Estimate], Any]
     runs: int
     seed: int

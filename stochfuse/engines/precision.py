@@ -35,11 +35,10 @@ import numpy as np
 from stochfuse.engines.mean_field import BLOCK, Case, SquareRoot, run
 from stochfuse.errors import StochfuseError
 from stochfuse.estimators.ledger import InformationClaims, Ledger, Sources, evaluate
-from stochfuse.estimators.world import batched
 from stochfuse.kalman.algebra import inverse
 from stochfuse.kalman.kernel import Estimate, Information, at_step, factor, predict, predict_information, update
-from stochfuse.scenario.model import Noises, Sensor
-from stochfuse.scenario.scenario import Scenario
+from stochfuse.scenario.model import Sensor
+from stochfuse.scenario.system import Noises, System
 
 DRAWS = 3
 """Runs with moved numbers, of which the largest change counts."""
@@ -237,10 +236,10 @@ class MovedSources(Sources):
 
 
 def moved_claims(
-    scenario: Scenario, ledger: Ledger, sources: Callable[[], Sources]
+    system: System, ledger: Ledger, sources: Callable[[], Sources]
 ) -> Sequence[Callable[[], InformationClaims]]:
     """What a ledger's values claim with moved numbers, a few times; not at all where rounding does not matter."""
-    if not suspects(scenario, Noises(P0=scenario.P0[None])).any():
+    if not suspects(system, Noises(P0=system.P0[None])).any():
         return ()
     given = sources()
     return [partial(_evaluated, ledger, given, seed) for seed in range(DRAWS)]
@@ -250,7 +249,7 @@ def _evaluated(ledger: Ledger, given: Sources, seed: int) -> InformationClaims:
     return InformationClaims(evaluate(ledger, MovedSources(given, seed)))
 
 
-def suspects(scenario: Scenario, noises: Noises) -> np.ndarray:
+def suspects(system: System, noises: Noises) -> np.ndarray:
     """Whether rounding may matter, (items,).
 
     Parameters
@@ -258,18 +257,18 @@ def suspects(scenario: Scenario, noises: Noises) -> np.ndarray:
     noises : each item's own, P0 among them.
     """
     items = 1 if noises.P0 is None else len(noises.P0)
-    if scenario.model.dimension == 1 and all(sensor.R.shape[-1] == 1 for sensor in scenario.sensors):
+    if system.model.dimension == 1 and all(sensor.R.shape[-1] == 1 for sensor in system.sensors):
         # numbers are added and divided, which rounding does not harm
         return np.zeros(items, dtype=bool)
     with np.errstate(all="ignore"):
-        found = np.broadcast_to(~(_growth(scenario, noises) <= BENIGN), (items,)).copy()
+        found = np.broadcast_to(~(_growth(system, noises) <= BENIGN), (items,)).copy()
         rest = np.flatnonzero(found)
         if len(rest):
-            found[rest] = ~(_growth_of_filters(scenario, noises.take(rest)) <= BENIGN)
+            found[rest] = ~(_growth_of_filters(system, noises.take(rest)) <= BENIGN)
     return found
 
 
-def _growth(scenario: Scenario, noises: Noises) -> np.ndarray:
+def _growth(system: System, noises: Noises) -> np.ndarray:
     """By how much rounding may grow, (items,) or (1,): bounds D_ii of P_ii times bounds of Y_ii, and R_ii (R⁻¹)_ii.
 
     Nothing that was ever heard reduces the one, and no noise the other:
@@ -279,13 +278,13 @@ def _growth(scenario: Scenario, noises: Noises) -> np.ndarray:
     An error ε √(Y_ii Y_jj) in every entry of Y = P⁻¹ makes one of at most ε d² max P_ii Y_ii in P, in units of its
     deviations.
     """
-    model, network, kinds = scenario.model, scenario.network, scenario.sensor_of
+    model, network, kinds = system.model, system.network, system.sensor_of
     F = _used(model.F)
     Q, Q_varies = (model.Q, model.Q.ndim > 2) if noises.Q is None else (noises.Q, False)
-    P0 = scenario.P0 if noises.P0 is None else noises.P0
+    P0 = system.P0 if noises.P0 is None else noises.P0
     try:
         F_inv, Y0 = np.linalg.inv(F), np.linalg.inv(P0)
-        measured = [_measured(sensor, noises, kinds.count(kind)) for kind, sensor in enumerate(scenario.sensors)]
+        measured = [_measured(sensor, noises, kinds.count(kind)) for kind, sensor in enumerate(system.sensors)]
     except np.linalg.LinAlgError:
         return np.array([np.inf])
     D, y, Q = np.abs(_diagonal(P0)), np.abs(_diagonal(Y0)) * network.agents, np.abs(_diagonal(Q))
@@ -318,32 +317,32 @@ def _diagonal(M: np.ndarray) -> np.ndarray:
     return np.diagonal(M, axis1=-2, axis2=-1)
 
 
-def ill_noise(scenario: Scenario) -> bool:
+def ill_noise(system: System) -> bool:
     """Whether rounding may grow in some measurement noise R."""
     try:
-        found = [_measured(sensor, Noises(), 1)[2] for sensor in scenario.sensors if sensor.R.shape[-1] > 1]
+        found = [_measured(sensor, Noises(), 1)[2] for sensor in system.sensors if sensor.R.shape[-1] > 1]
     except np.linalg.LinAlgError:
         return True
     return not max(found, default=0.0) <= BENIGN
 
 
-def _growth_of_filters(scenario: Scenario, noises: Noises) -> np.ndarray:
+def _growth_of_filters(system: System, noises: Noises) -> np.ndarray:
     """Growth of rounding, (items,) or (1,), for agents that hear nobody, or everyone, at all steps.
 
     P⁻_ii (M + n HᵀR⁻¹H)_ii with M = (F P Fᵀ)⁻¹, what information there is before the process noise comes to it.
     """
-    given, kinds = batched(scenario, noises), scenario.sensor_of
-    model, d = given.model, scenario.model.dimension
+    given, kinds = system.with_noises(noises), system.sensor_of
+    model, d = given.model, system.model.dimension
     heard = [Counter([kind]) for kind in sorted(set(kinds))] + [Counter(kinds)]
     counts = np.array([[n[kind] for n in heard] for kind in range(len(given.sensors))], dtype=float)[
         ..., None, None, None
     ]
     try:
-        grown = np.max([_measured(sensor, noises, 1)[2] for sensor in scenario.sensors], axis=0)
-        P = given.P0.reshape(-1, d, d) / (1.0 if scenario.correlation == "shared" else counts.sum(axis=0))
+        grown = np.max([_measured(sensor, noises, 1)[2] for sensor in system.sensors], axis=0)
+        P = given.P0.reshape(-1, d, d) / (1.0 if system.shared else counts.sum(axis=0))
         P = np.broadcast_to(P, (len(heard), *P.shape[-3:]))
         grown = np.maximum(grown, (_diagonal(P) * _diagonal(inverse(P))).max(axis=(0, -1)))
-        for step in range(2, scenario.network.steps + 1):
+        for step in range(2, system.steps + 1):
             F, Q = at_step(model.F, step), at_step(model.Q, step)
             moved = predict(Estimate(None, P), F, 0.0 * Q).P
             P, Y = moved + Q, inverse(moved)

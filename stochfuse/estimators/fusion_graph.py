@@ -273,7 +273,7 @@ class FusionGraph:
             raise UsageError(
                 f"measurements: expected shape (steps, agents, p) = ({steps}, {n}, p), got {records.shape}"
             )
-        values = evaluate(self.ledger, sources_of(scenario, records, by_agent=True))
+        values = evaluate(self.ledger, sources_of(scenario.system, records, by_agent=True))
         for (_, step), value in self._fused.items():
             check_definite(values.Y[value], step)
         found = from_information(values)

@@ -135,6 +135,21 @@ class Ledger(Renamed):
                 total[atom] = total.get(atom, 0) + coefficient * times
         return self._value(step, tuple(sorted([pair for pair in total.items() if pair[1]])))
 
+    def signatures(self) -> np.ndarray:
+        """Two random numbers per value, (values + 1, 2), that add up modulo 2^64 as the sums do; the last: nothing."""
+        random = np.random.default_rng(0).integers(1 << 64, size=(len(self.atoms), 2), dtype=np.uint64)
+        which, times, first = self.table()
+        signed = times.astype(np.int64).view(np.uint64)[:, None] * random[which]
+        total = np.add.reduceat(signed, first, axis=0)
+        return np.concatenate([total, np.zeros((1, 2), dtype=np.uint64)])
+
+    def table(self, values: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Sums of values (default: all): atoms and coefficients one after the other, and where each sum begins."""
+        sums = self.sums if values is None else [self.sums[value] for value in values]
+        which, times = np.array([pair for sum_ in sums for pair in sum_], dtype=int).reshape(-1, 2).T
+        first = np.cumsum([0] + [len(sum_) for sum_ in sums[:-1]])
+        return which, times, first
+
     def _renamed(self, value: int, into: Ledger, names: Sequence[int], known: dict[int, int]) -> int:
         new = known.get(value)
         if new is None:
@@ -232,9 +247,7 @@ def evaluate(ledger: Ledger, sources: Sources) -> Information:
     """
 
     def total(values: np.ndarray, atoms: np.ndarray) -> np.ndarray:
-        terms = [ledger.sums[value] for value in values]
-        which, times = np.array([pair for sum_ in terms for pair in sum_], dtype=int).T
-        first = np.cumsum([0] + [len(sum_) for sum_ in terms[:-1]])
+        which, times, first = ledger.table(values)
         return np.add.reduceat(times.reshape(-1, *(1,) * (atoms.ndim - 1)) * atoms[which], first, axis=0)
 
     atoms, value_step = evaluate_atoms(ledger.atoms, sources, total), np.array(ledger.step)
@@ -295,13 +308,14 @@ class InformationClaims:
     def __init__(self, information: Information) -> None:
         d = information.Y.shape[-1]
         self.information, y = information, information.y
-        self.width = d * max(d, 0 if y is None else y.shape[-1])
+        items = information.Y[0].size // d**2
+        self.width = items * d * max(d, 0 if y is None else y.shape[-1])
         # the last entry, −1, stands for nothing
-        self._Y = np.concatenate([information.Y, np.zeros((1, d, d))])
+        self._Y = np.concatenate([information.Y, np.zeros_like(information.Y[:1])])
         self._y = None if y is None else np.concatenate([y, np.zeros_like(y[:1])])
 
-    def estimate(self, terms: Sequence[tuple[int, np.ndarray]], step: int) -> tuple[Estimate, float]:
-        """Estimates of a step from sums of values.
+    def estimate(self, terms: Sequence[tuple[int, np.ndarray]], step: int) -> tuple[Estimate, np.ndarray]:
+        """Estimates of a step from sums of values, and by how much rounding grew, for each item of a batch.
 
         Raises
         ------
@@ -311,7 +325,7 @@ class InformationClaims:
         Y: Any = sum(sign * self._Y[values] for sign, values in terms)
         y = None if self._y is None else sum(sign * self._y[values] for sign, values in terms)
         estimate, magnified = estimated(Information(y, Y), step)
-        return estimate, float(magnified.max())
+        return estimate, magnified.max(axis=(0, -1))
 
 
 def estimated(information: Information, step: int) -> tuple[Estimate, np.ndarray]:

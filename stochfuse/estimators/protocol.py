@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from stochfuse.estimators.ledger import Ledger, Renamed
+from stochfuse.scenario.system import Noises, System
 
 
 class Late(NamedTuple):
@@ -110,8 +111,9 @@ class Claims(Protocol):
 
     width: int
 
-    def estimate(self, terms: Sequence[tuple[int, np.ndarray]], step: int) -> tuple[Any, float]:
-        """Estimates of a step, Σ sign · value over (sign, values of any one shape), and by how much rounding grew.
+    def estimate(self, terms: Sequence[tuple[int, np.ndarray]], step: int) -> tuple[Any, Any]:
+        """Estimates of a step, Σ sign · value over (sign, values of any one shape), and by how much rounding grew, one
+        number or one for each item of a batch.
 
         An `Estimate` of P (..., d, d) and x (..., d, columns), which holds data or a noise footprint or is None; or the
         `Moments` of the error themselves.
@@ -120,10 +122,11 @@ class Claims(Protocol):
 
 
 class Made(NamedTuple):
-    """An estimator, and what to call for its numbers once everything of interest has been written down."""
+    """An estimator by its name, and what makes numbers, of a system and noises of items, of all it has written down."""
 
+    name: str
     estimator: Any
-    claims: Callable[[], Claims]
+    claims: Callable[[System, Noises], Claims]
 
 
 class FusionRule:

@@ -21,7 +21,7 @@ import numpy as np
 
 from stochfuse.errors import UsageError
 from stochfuse.estimators.ledger import Renamed
-from stochfuse.estimators.protocol import Late, Made, in_least_order
+from stochfuse.estimators.protocol import Late, in_least_order
 from stochfuse.estimators.world import Footprints, World
 from stochfuse.kalman.kernel import Estimate, at_step, predict, update
 from stochfuse.kalman.metrics import Moments
@@ -135,10 +135,6 @@ class RecursiveEstimator:
     def work(self, step: int, rules: Sequence[Rule], rests_on: list[Worked]) -> Worked:
         """Work a batch out, from stacks of what it rests on; all have one rule unless its name is in `mixed`."""
         raise NotImplementedError
-
-    def make(self) -> Made:
-        """Return the estimator with its claims."""
-        return Made(self, lambda: PastClaims(self))
 
     def batch(self, step: int, rules: Sequence[Rule], rests_on: list[Worked]) -> Worked:
         """Work out the rules that all estimators share, and leave the others to `work`."""

@@ -43,8 +43,8 @@ from stochfuse.errors import UsageError
 from stochfuse.estimators.ledger import Sources
 from stochfuse.kalman.kernel import Estimate, Information, at_step, factor, to_information
 from stochfuse.kalman.metrics import Moments
-from stochfuse.scenario.model import Filter, Noises
-from stochfuse.scenario.scenario import Scenario
+from stochfuse.scenario.model import Filter, once
+from stochfuse.scenario.system import Noises, System
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +194,7 @@ def _slices(sizes: list[int]) -> list[slice]:
     return [slice(a, b) for a, b in pairwise(ends)]
 
 
-def sources_of(scenario: Scenario, records: np.ndarray | None = None, *, by_agent: bool = False) -> Sources:
+def sources_of(system: System, records: np.ndarray | None = None, *, by_agent: bool = False) -> Sources:
     """Return what start and measurements of every source are worth.
 
     Parameters
@@ -207,60 +207,44 @@ def sources_of(scenario: Scenario, records: np.ndarray | None = None, *, by_agen
     UsageError
         If the initial covariance has no inverse.
     """
-    start = _start(scenario, None if records is None else scenario.x0)
-    sensors = scenario.sensors
+    start = _start(system, None if records is None else system.x0)
+    sensors = system.sensors
     if by_agent or records is not None:
-        sensors = [scenario.sensors[kind] for kind in scenario.sensor_of]
+        sensors = [system.sensors[kind] for kind in system.sensor_of]
     columns = None if records is None else [[z[..., None] for z in step] for step in records]
-    return Sources(scenario.model, sensors, [start] * len(sensors), columns)
+    return Sources(system.model, sensors, [start] * len(sensors), columns)
 
 
-def error_sources(scenario: Scenario, noises: Noises | None = None) -> Sources:
+def error_sources(system: System, noises: Noises | None = None) -> Sources:
     """Return the same for every agent, with noise footprints in the place of data; see `moments`.
 
     Parameters
     ----------
-    noises : of a batch, P0 among them, in the place of the scenario's.
+    noises : of a batch, P0 among them, in the place of the system's.
 
     Raises
     ------
     UsageError
         If the initial covariance has no inverse.
     """
-    unit, told = (scenario, scenario) if noises is None else (_unit(scenario, noises), batched(scenario, noises))
+    unit, told = (system, system) if noises is None else (_unit(system, noises), system.with_noises(noises))
     LQ, LR, LP = _roots(noises)
     world = world_of(unit)
     footprints, steps, everyone = Footprints(world), range(2, world.steps + 1), range(world.agents)
     starts = [_start(told, _in_units(LP, footprints.start(rows))) for rows in world.states]
     # all agents see one process noise, so that the first agent's rows are everyone's
     moved = [_in_units(LQ, footprints.process(step, world.states[0])) for step in steps]
-    inputs = np.stack(np.broadcast_arrays(np.zeros((scenario.model.dimension, footprints.columns)), *moved))
+    inputs = np.stack(np.broadcast_arrays(np.zeros((system.model.dimension, footprints.columns)), *moved))
     nothing = [np.zeros((H.shape[-2], footprints.columns)) for H in world.H]
     measured = ([_in_units(LR, footprints.measured(step, agent)) for agent in everyone] for step in steps)
     sensors = [told.sensors[kind] for kind in told.sensor_of]
     return Sources(replace(told.model, Bu=inputs), sensors, starts, [nothing, *measured])
 
 
-def batched(scenario: Scenario, noises: Noises) -> Scenario:
-    """Return the scenario with the noises of a batch in the place of its own: for the numbers only.
-
-    P0 is then of shape (items, d, d) and, where the noises have them, Q of (steps, items, d, d) and R of
-    (steps, items, p, p).
-    """
-    steps, (Q, R, P0) = scenario.network.steps, noises
-    model, sensors = scenario.model, scenario.sensors
-    return replace(
-        scenario,
-        model=model if Q is None else replace(model, Q=np.broadcast_to(Q, (steps, *Q.shape))),
-        sensors=sensors if R is None else tuple(replace(s, R=np.broadcast_to(R, (steps, *R.shape))) for s in sensors),
-        P0=scenario.P0 if P0 is None else P0,
-    )
-
-
-def _unit(scenario: Scenario, noises: Noises) -> Scenario:
-    """Return the scenario with unit noises in the place of a batch's."""
+def _unit(system: System, noises: Noises) -> System:
+    """Return the system with unit noises in the place of the items'."""
     units = (None if M is None else np.eye(M.shape[-1]) for M in noises)
-    return batched(scenario, Noises(*units))
+    return system.with_noises(Noises(*units))
 
 
 def _roots(noises: Noises | None) -> tuple[np.ndarray | None, ...]:
@@ -279,37 +263,37 @@ def _in_units(root: np.ndarray | None, footprint: np.ndarray) -> np.ndarray:
     return np.concatenate([noises, np.broadcast_to(footprint[:, -1:], (*noises.shape[:-1], 1))], axis=-1)
 
 
-def world_of(scenario: Scenario) -> World:
+def world_of(system: System) -> World:
     """Return what the agents' filters are told, and how all noises truly hang together."""
-    n, steps, model = scenario.network.agents, scenario.network.steps, scenario.model
-    sensors = [scenario.sensors[kind] for kind in scenario.sensor_of]
-    filters = scenario.filters or (_filter(scenario),) * n
-    together = np.ones((n, n)) if not scenario.own and not scenario.filters else np.eye(n)
-    shared = np.ones((n, n)) if scenario.correlation == "shared" else np.eye(n)
-    if scenario.filters:
+    n, steps, model = system.agents, system.steps, system.model
+    sensors = [system.sensors[kind] for kind in system.sensor_of]
+    filters = system.filters or (_filter(system),) * n
+    together = np.ones((n, n)) if not system.own and not system.filters else np.eye(n)
+    shared = np.ones((n, n)) if system.shared else np.eye(n)
+    if system.filters:
         Q, P0 = _stacked([f.Q for f in filters], steps), _stacked([f.P0 for f in filters], steps)
     else:
-        Q, P0 = np.kron(together, model.Q), np.kron(shared, scenario.P0)
-    b = scenario.error
+        Q, P0 = np.kron(together, once(model.Q)), np.kron(shared, system.P0)
+    b = system.error
     return World(
         steps=steps,
         F=tuple(f.F for f in filters),
-        H=tuple(s.H for s in sensors),
-        R=tuple(s.R for s in sensors),
-        Q=Q if scenario.process is None else scenario.process,
+        H=tuple(once(s.H) for s in sensors),
+        R=tuple(once(s.R) for s in sensors),
+        Q=Q if system.process is None else system.process,
         P0=P0,
-        correlation=None if scenario.noise is None else scenario.noise.correlation,
-        disturbance=None if scenario.noise is None else scenario.noise.disturbance,
+        correlation=None if system.noise is None else system.noise.correlation,
+        disturbance=None if system.noise is None else system.noise.disturbance,
         error=None if b is None else np.concatenate([np.linalg.pinv(f.M) @ b for f in filters]),
-        own=scenario.own,
-        relations=scenario.relations,
-        M=tuple(f.M for f in filters) if scenario.filters and not scenario.own else None,
+        own=system.own,
+        relations=system.relations,
+        M=tuple(f.M for f in filters) if system.filters and not system.own else None,
     )
 
 
-def _filter(scenario: Scenario) -> Filter:
-    d = scenario.model.dimension
-    return Filter(scenario.model.F, scenario.model.Q, scenario.P0, np.eye(d), np.zeros((d, 1)))
+def _filter(system: System) -> Filter:
+    d = system.model.dimension
+    return Filter(once(system.model.F), once(system.model.Q), system.P0, np.eye(d), np.zeros((d, 1)))
 
 
 def _stacked(blocks: Sequence[np.ndarray], steps: int) -> np.ndarray:
@@ -333,9 +317,9 @@ def claimed_only(estimate: Estimate | Moments) -> Moments:
     return Moments(estimate.P)
 
 
-def _start(scenario: Scenario, x: np.ndarray | None) -> Information:
+def _start(system: System, x: np.ndarray | None) -> Information:
     try:
-        start = to_information(Estimate(x, scenario.P0))
+        start = to_information(Estimate(x, system.P0))
     except np.linalg.LinAlgError:
         start = None
     if start is None or not np.isfinite(start.Y).all():

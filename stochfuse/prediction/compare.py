@@ -13,9 +13,10 @@ from stochfuse.engines.enumeration import TooManyError
 from stochfuse.engines.events import events
 from stochfuse.errors import NoAnswerError, UsageError
 from stochfuse.kalman.metrics import Metric
-from stochfuse.prediction.predict import ESTIMATORS, METHODS, choose, predict
+from stochfuse.prediction.predict import choose, predict
 from stochfuse.prediction.quantities import QUANTITIES
 from stochfuse.prediction.result import Prediction
+from stochfuse.scenario.registry import ESTIMATORS, METHODS
 from stochfuse.scenario.scenario import Scenario, link_rows
 
 DEFAULT_METHODS = ("general", "simplified", "naive", "monte-carlo")

@@ -2,28 +2,30 @@
 
     (49)  E[P(k)] = Σ_S µ_S µ_¬S P_S(k)        (48)  E[x̂(k)] = Σ_S µ_S µ_¬S x̂_S(k)
 
-over the outcomes S of "which messages arrive, in all steps up to k", (45)/(46).  P_S and x̂_S are what the Local
-Fusion Graph claims in that outcome (or naive fusion, (42)/(43), with its estimator).  With one µ for all links,
+over the outcomes S of "which messages arrive, in all steps up to k", (45)/(46).  P_S and x̂_S are what the estimator
+claims in that outcome: the Local Fusion Graph, or naive fusion (42)/(43), or any other.  With one µ for all links,
 
-    E[P(k)](µ) = Σ_c A_c µ^c (1−µ)^(L−c)
+    E[P(k)](µ) = Σ_c A_c µ^c (1−µ)^(L−c) = Σ_v w_v(µ) P_v(k)
 
-is a polynomial whose coefficients are found once; with unequal µ_ij(k) every row of link probabilities is summed.
+is a polynomial; its weights w_v over the different claims v depend on agents and links alone, are found once and kept,
+and serve every µ, Q, R and P(k0).  With unequal µ_ij(k) every row of link probabilities has weights of its own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from stochfuse.engines.distribution import Distribution, parse_statistic
-from stochfuse.engines.enumeration import Request, Structure, TooManyError, claimed, enumerate_outcomes, expectation
+from stochfuse.engines.enumeration import Claimed, Request, Structure, TooManyError, claims_of, enumerate_outcomes
 from stochfuse.engines.events import (
     MOST_AGENTS_RELABELLED,
     Rows,
+    Weights,
     bernstein,
     bursty,
     events,
@@ -32,22 +34,31 @@ from stochfuse.engines.events import (
     relabellings,
     weights_for,
 )
-from stochfuse.engines.precision import change, moved_claims, reach
-from stochfuse.engines.progress import Progress
-from stochfuse.errors import StochfuseError, UsageError
-from stochfuse.estimators.making import SUMS, make
+from stochfuse.engines.precision import NO_DIGIT, PROMISED, MovedSources, change, moved_claims, notes, reach, suspects
+from stochfuse.errors import NoAnswerError, StochfuseError, UsageError
+from stochfuse.estimators.ledger import InformationClaims, evaluate
+from stochfuse.estimators.making import SUMS, make, sources
 from stochfuse.estimators.protocol import Claims, Made
-from stochfuse.estimators.world import error_sources, moments, sources_of
+from stochfuse.estimators.world import claimed_only, moments
 from stochfuse.kalman.kernel import Estimate
 from stochfuse.kalman.metrics import Metric, Moments
+from stochfuse.prediction.method import Averaged, Settings, group_of, joined
 from stochfuse.prediction.quantities import linear, matrix, number, value
-from stochfuse.scenario.network import LinkRows, Network, number_of_senders, uniform_rows
-from stochfuse.scenario.scenario import Scenario
+from stochfuse.scenario.network import LinkRows, Network, number_of_senders, restricted, uniform_rows
+from stochfuse.scenario.system import Items, Noises, System
 
 MOST_PROBABILITIES = 20_000_000
 """Probabilities that a distribution may hold at a time."""
 MOST_AGENTS, MOST_SENDERS = 40, 12
 """Agents, and agents that one of them may hear, up to which outcomes are listed."""
+KEPT = 8
+"""Structures kept for what is asked next."""
+HELD = 1 << 24
+"""Weights of claims that are held, and not found again when they are needed again."""
+CHUNK = 1 << 21
+"""Numbers of estimates that are worked on at a time."""
+BLOCK = 1 << 20
+"""Numbers that the values of a block of items take."""
 
 
 def itself(estimate: Estimate) -> Estimate:
@@ -55,34 +66,114 @@ def itself(estimate: Estimate) -> Estimate:
     return estimate
 
 
-@dataclass(frozen=True, eq=False)
-class Outcomes:
-    """All outcomes of a scenario with what is claimed in each.
+@dataclass(eq=False)
+class Enumerated:
+    """All outcomes of a system before any number is put in.
 
     Parameters
     ----------
-    scenario, rows : what was given.
-    groups : agents that are alike, as sorted tuples.
+    groups : agents that are alike.
     structure : the outcomes.
-    values : numbers for every value in the structure.
+    made : the estimator that has written them down.
     weights : bookkeeping of probabilities.
-    of : what is averaged: the estimate itself, or the moments of its error (quantities other than claimed need them).
-    again : what the values claim with moved numbers, to be called for; see `stochfuse.engines.precision`.
     """
 
-    scenario: Scenario
-    rows: LinkRows
     groups: tuple[tuple[int, ...], ...]
     structure: Structure
-    values: Claims
-    weights: Any
-    of: Callable[[Estimate], Any] = itself
-    again: Callable[[], Sequence[Callable[[], Claims]]] = tuple
+    made: Made
+    weights: Weights
+    _held: dict[int, list[Claimed]] = field(default_factory=dict)
+
+    @property
+    def polynomial(self) -> bool:
+        """Whether weights are polynomials in one link probability."""
+        return not isinstance(self.weights, Rows)
+
+    @cached_property
+    def signatures(self) -> np.ndarray | None:
+        """Numbers by which equal sums of values are told."""
+        return self.made.estimator.ledger.signatures() if self.made.estimator.additive else None
+
+    def claims(self, step: int) -> Iterable[Claimed]:
+        """Different claims of a step with their weights."""
+        if step not in self._held:
+            found = claims_of(self.structure.endings[step - 1], self.signatures, self.weights)
+            held, numbers = [], 0
+            for block in found:
+                held.append(block)
+                numbers += block.weights.size
+                if numbers > HELD:
+                    return _rest(held, found)
+            self._held[step] = held
+        return self._held[step]
+
+    def shared_out(self, step: int, values: Claims) -> Iterator[tuple[np.ndarray, Any, Any]]:
+        """Claims of a step in numbers, some at a time: weights (groups, width, claims), estimates, and by how much
+        rounding grew in them.
+        """
+        for block in self.claims(step):
+            claims = block.weights.shape[2]
+            size = max(1, CHUNK // values.width)
+            for first in range(0, claims, size):
+                some = slice(first, first + size)
+                estimate, grown = values.estimate([(sign, ids[some]) for sign, ids in block.terms], step)
+                yield block.weights[:, :, some], estimate, grown
+
+
+def _rest(held: list[Claimed], found: Iterator[Claimed]) -> Iterator[Claimed]:
+    yield from held
+    yield from found
+
+
+@dataclass(frozen=True, eq=False)
+class Outcomes:
+    """All outcomes of a system with what is claimed in each.
+
+    Parameters
+    ----------
+    system, links : what was given, with one set of noises.
+    found : the outcomes.
+    errors : whether the moments of the actual error are averaged, or the estimates as they are.
+    records : measurements, where states are wanted.
+    """
+
+    system: System
+    links: LinkRows
+    found: Enumerated
+    errors: bool = False
+    records: np.ndarray | None = None
+
+    @property
+    def groups(self) -> tuple[tuple[int, ...], ...]:
+        """Agents that are alike, as sorted tuples."""
+        return self.found.groups
+
+    @property
+    def structure(self) -> Structure:
+        """The outcomes."""
+        return self.found.structure
 
     @property
     def polynomial(self) -> bool:
         """Whether the expectation is a polynomial in one link probability."""
-        return not isinstance(self.weights, Rows)
+        return self.found.polynomial
+
+    @cached_property
+    def common(self) -> np.ndarray:
+        """Link probability µ of each row, of a polynomial, (rows,)."""
+        µ = self.links.common(self.system.network)
+        if µ is None:
+            raise TypeError("links that differ have no common probability")
+        return µ
+
+    @cached_property
+    def values(self) -> Claims:
+        """Numbers for every value in the structure."""
+        return self.found.made.claims(self.system, Noises())
+
+    @property
+    def _of(self) -> Callable[[Estimate], Any]:
+        return moments if self.errors else itself
 
     @cached_property
     def expectations(self) -> list[list[Any]]:
@@ -97,8 +188,8 @@ class Outcomes:
         return self._expectations(self.values)
 
     def _expectations(self, values: Claims) -> list[tuple[list[Any], float]]:
-        groups = len(self.groups)
-        return [expectation(e, values, self.weights, groups, self.of) for e in self.structure.endings]
+        steps = range(1, self.system.steps + 1)
+        return [_expectation(self.found.shared_out(step, values), self._of) for step in steps]
 
     @cached_property
     def rounding(self) -> float:
@@ -107,12 +198,21 @@ class Outcomes:
         The larger of what the last inversion of an outcome's information loses, and what moved numbers change.
         """
         lost = 2e-16 * max(magnified for _, magnified in self._expected)
-        again = self.again()
+        again = self._again()
         return max(lost, float(reach(lambda seed: self._change(again[seed]()), len(again))))
+
+    def _again(self) -> Sequence[Callable[[], Claims]]:
+        """What the values claim with moved numbers, to be called for; of pasts it is not known."""
+        estimator = self.found.made.estimator
+        if not hasattr(estimator, "ledger"):
+            return ()
+        return moved_claims(
+            self.system, estimator.ledger, partial(sources, self.system, Noises(), self.errors, self.records)
+        )
 
     def _change(self, values: Claims) -> float:
         """Largest change of an expected covariance if the values claimed others."""
-        quantities = ("claimed",) if self.of is itself else ("claimed", "actual", "rms")
+        quantities = ("claimed", "actual", "rms") if self.errors else ("claimed",)
         pairs = zip(self._expected, self._expectations(values), strict=True)
         groups = [pair for (found, _), (moved, _) in pairs for pair in zip(found, moved, strict=True)]
         return max(float(change(matrix(q, a), matrix(q, b)).max()) for q in quantities for a, b in groups)
@@ -147,7 +247,7 @@ class Outcomes:
 
     def moments(self, link: np.ndarray | None = None) -> Moments:
         """Expected moments of the error that were averaged, (rows, steps, groups, …), where `covariance` has them."""
-        if self.of is itself:
+        if not self.errors:
             return Moments(self.covariance(link))
         return Moments(*(self.covariance(link, q) for q in ("claimed", "actual", "bias", "rms")))
 
@@ -157,11 +257,11 @@ class Outcomes:
 
     def _stacked(self, by_step: list[list[np.ndarray]]) -> np.ndarray:
         stacked = np.stack([np.stack(by_group, axis=1) for by_group in by_step], axis=1)
-        return stacked if self.polynomial else stacked / self._kept()[:, :, None, None, None]
+        return stacked if self.polynomial else stacked / self._kept[:, :, None, None, None]
 
     def derivative(self, quantity: str = "claimed") -> np.ndarray:
         """dE[P]/dµ at the scenario's rows, (rows, steps, groups, d, d); or of another quantity's matrix."""
-        µ = self.rows.link
+        µ = self.common
         out = []
         for step in range(1, len(self.expectations) + 1):
             by_group = []
@@ -178,12 +278,14 @@ class Outcomes:
     @property
     def left_out(self) -> np.ndarray:
         """Probability of the outcomes left out, (rows, steps)."""
-        if self.polynomial:
-            return np.zeros((len(self.rows.link), len(self.structure.endings)))
-        return 1.0 - self._kept()
+        return 1.0 - self._kept if not self.polynomial else np.zeros((len(self.common), self.system.steps))
 
+    @cached_property
     def _kept(self) -> np.ndarray:
-        return np.stack([self.weights.collected(e.weights.sum(axis=0)) for e in self.structure.endings], axis=1)
+        """Probability of the outcomes that were not left out, (rows, steps)."""
+        steps = range(1, self.system.steps + 1)
+        by_step = [sum(block.weights[0].sum(axis=-1) for block in self.found.claims(step)) for step in steps]
+        return np.stack(by_step, axis=1)
 
     def statistic(self, name: str, metric: Metric, groups: Sequence[int], quantity: str = "claimed") -> np.ndarray:
         """Return a statistic of a metric over the outcomes, (rows, steps).
@@ -228,9 +330,8 @@ class Outcomes:
 
     def _blocks_of_rows(self, step: int) -> list[slice]:
         """Rows in blocks small enough that a distribution of each fits in memory."""
-        views, rows = self.structure.endings[step - 1].views, len(self.rows.link)
-        values = sum(len(view.ids) * len(view.terms[0][1]) for view in views)
-        size = max(1, MOST_PROBABILITIES // values)
+        rows, claims = len(self.links.link), sum(block.weights.shape[2] for block in self.found.claims(step))
+        size = max(1, MOST_PROBABILITIES // claims)
         return [slice(first, first + size) for first in range(0, rows, size)]
 
     def distribution(
@@ -245,44 +346,60 @@ class Outcomes:
 
         Several groups of agents: of an agent picked at random.
         """
-        ending = self.structure.endings[step - 1]
         agents = sum(len(self.groups[g]) for g in groups)
+        share = np.array([len(self.groups[g]) / agents for g in groups])
         values, weights = [], []
-        for view, states, estimate, _ in claimed(ending, self.values):
-            shares = [(view.shares[g], len(self.groups[g]) / agents) for g in groups if view.shares[g] is not None]
-            if not shares:
+        for by_group, estimate, _ in self.found.shared_out(step, self.values):
+            weight = np.tensordot(share, by_group[list(groups)], axes=1)
+            some = np.flatnonzero(weight.any(axis=0))
+            if not len(some):
                 continue
             with np.errstate(over="ignore", invalid="ignore", under="ignore"):
-                found = value(quantity, metric, Moments(estimate.P) if quantity == "claimed" else self.of(estimate))
+                all_of = (moments if self.errors else claimed_only)(estimate)
+                found = value(quantity, metric, all_of.map(lambda M: M[some]))  # noqa: B023
             if not np.isfinite(found).all():
                 raise StochfuseError(f"{metric.label} is not finite in some outcome: it grows beyond floating point")
-            before = self._probability(ending.weights[states], rows)
-            cells = np.repeat(self._probability(view.factors, rows), np.diff([*view.starts, found.shape[1]]), axis=1)
-            last = sum(part * self._probability(share[None], rows) for share, part in shares)
-            values.append(found.ravel())
-            both = before[:, :, None] * (cells * last)[:, None, :]
-            weights.append(self._collected(both.reshape(len(both), -1), rows))
+            values.append(found)
+            weights.append(self._probability(weight[:, some], rows))
         merged = Distribution.merged(np.concatenate(values), np.concatenate(weights, axis=1))
         return Distribution(merged.values, merged.probability / merged.probability.sum(axis=1, keepdims=True))
 
-    def _probability(self, table: np.ndarray, rows: slice) -> np.ndarray:
-        """Probabilities (rows, entries) of entries given on the weights' axis."""
+    def _probability(self, weight: np.ndarray, rows: slice) -> np.ndarray:
+        """Probabilities (rows, claims) from weights on the weights' axis."""
         if self.polynomial:
-            return monomials(table.shape[1] - 1, self.rows.link[rows]) @ table.T
-        if not self.weights.memory:
-            return table.T[rows]
-        links = len(self.rows.link)
-        return table.T.reshape(links, -1, len(table))[rows].reshape(-1, len(table))
-
-    def _collected(self, probability: np.ndarray, rows: slice) -> np.ndarray:
-        """Sum over what is hidden of the links, (rows, entries)."""
-        chosen = len(range(*rows.indices(len(self.rows.link))))
-        return probability.reshape(chosen, -1, probability.shape[1]).sum(axis=1)
+            return monomials(len(weight) - 1, self.common[rows]) @ weight
+        return weight[rows]
 
     def _at(self, expected: np.ndarray, link: np.ndarray | None) -> np.ndarray:
         if not self.polynomial:
             return expected
-        return bernstein(expected, len(expected) - 1, self.rows.link if link is None else link)
+        return bernstein(expected, len(expected) - 1, self.common if link is None else link)
+
+
+def _expectation(
+    claims: Iterable[tuple[np.ndarray, Any, Any]], of: Callable[[Estimate], Any]
+) -> tuple[list[Any], float]:
+    """Expected state and covariance per group of agents, (48)/(49), on the weights' axis, and growth of rounding.
+
+    Parameters
+    ----------
+    of : makes what is averaged, a named tuple of arrays or Nones, of a stack of estimates.
+    """
+    magnified, total, kind = 1.0, {}, None
+    groups = 0
+    for weights, estimate, grown in claims:
+        magnified, averaged, groups = max(magnified, float(grown)), of(estimate), len(weights)
+        kind = type(averaged)
+        for place, values in enumerate(averaged):
+            if values is not None:
+                part = np.tensordot(weights, values, axes=1)
+                total[place] = total[place] + part if place in total else part
+    if kind is None:
+        raise StochfuseError("no outcome is possible")
+    by_group = [
+        [total[place][g] if place in total else None for place in range(len(kind._fields))] for g in range(groups)
+    ]
+    return [kind(*found) for found in by_group], magnified
 
 
 def check_statistic(name: str, quantity: str, metric: Metric) -> tuple[str, float]:
@@ -302,111 +419,149 @@ def check_statistic(name: str, quantity: str, metric: Metric) -> tuple[str, floa
     return kind, number
 
 
+def averaged(system: System, items: Items, how: Settings, errors: bool) -> Averaged:
+    """Average an estimator over all outcomes, (49); parameters are those of every method, see `Averaged`.
+
+    Raises
+    ------
+    UsageError
+        If the outcomes are too many, or a covariance has no inverse.
+    NoAnswerError
+        If nothing can be inferred from some outcome; names the items where they are known.
+    """
+    if how.max_graphs < 1:
+        raise UsageError(f"max_graphs: expected a whole number of at least 1, got {how.max_graphs}")
+    if not items.noises.common and how.estimator in SUMS and not how.prune:
+        µ = items.links.common(system.network)
+        if µ is not None and not (errors and system.noise is not None and system.noise.disturbance is not None):
+            return _over_items(system, µ, items, how, errors)
+    parts = []
+    for members, alone, some in items.by_noises(system):
+        parts.append((members, _of_outcomes(outcomes(alone, some.links, how, errors=errors))))
+    return joined(parts)
+
+
+def _of_outcomes(found: Outcomes) -> Averaged:
+    left_out, rows, estimator = found.left_out, len(found.links.link), found.found.made.name
+    said = []
+    if left_out.max() > 1e-12:
+        row, step = np.unravel_index(left_out.argmax(), left_out.shape)
+        said.append(
+            f"outcomes of probability up to {left_out.max():.2g} (at µ = "
+            f"{found.links.means(found.system.network)[row]:g}, step {step + 1}) are left out; what is shown holds "
+            "given one of the others"
+        )
+    far = found.rounding
+    exact = left_out.max() <= 1e-12 and far <= PROMISED
+    return Averaged(
+        moments=found.moments(),
+        group_of=group_of(found.groups),
+        natures=np.full(rows, "exact" if exact else "approximate"),
+        estimator=estimator,
+        rounding=np.full(rows, far),
+        notes=(*said, *notes(far)),
+        outcomes=found,
+        meta={
+            "outcomes": found.structure.outcomes[-1],
+            "graphs": found.structure.states,
+            "left_out": left_out.tolist(),
+        },
+    )
+
+
 def outcomes(
-    scenario: Scenario,
-    rows: LinkRows,
-    estimator: str = "local-fusion-graph",
+    system: System,
+    links: LinkRows,
+    how: Settings = Settings(),  # noqa: B008  frozen
     *,
     records: np.ndarray | None = None,
     errors: bool = False,
-    max_graphs: int = 100_000,
-    prune: bool = False,
     plain: bool = False,
-    criterion: str = "det",
-    progress: Progress | None = None,
 ) -> Outcomes:
-    """Enumerate all outcomes of a scenario.
+    """Enumerate all outcomes of a system.
 
     Parameters
     ----------
-    rows : rows of link probabilities.
-    estimator : one of `stochfuse.prediction.predict.ESTIMATORS`.
+    links : rows of link probabilities.
+    how : estimator, limits and progress.
     records : measurements (steps, agents, p) where states are wanted.
     errors : whether the moments of the actual error are wanted too; not with records.
-    max_graphs : states that may be carried from step to step.
-    prune : leave the least likely states out where there are more.
     plain : merge nothing.
-    criterion : what the weights of an intersection minimise, see `stochfuse.estimators.making.make`.
-    progress : told how far the work is.
 
     Raises
     ------
     UsageError
         If the outcomes are too many, or a covariance has no inverse.
     """
-    found = enumerated(
-        scenario,
-        rows,
-        estimator,
-        records=records,
-        errors=errors,
-        max_graphs=max_graphs,
-        prune=prune,
-        plain=plain,
-        criterion=criterion,
-        progress=progress,
-    )
-    of, again = moments if errors else itself, tuple
-    if estimator in SUMS:
-        sources = partial(error_sources, scenario) if errors else partial(sources_of, scenario, records)
-        again = partial(moved_claims, scenario, found.made.estimator.ledger, sources)
-    return Outcomes(scenario, rows, found.groups, found.structure, found.made.claims(), found.weights, of, again)
+    if links.common(system.network) is None or plain or how.prune or records is not None:
+        found = _enumerated(system, links, how, records=records, errors=errors, plain=plain)
+    else:
+        found = _kept(_Asked.of(system, how, errors))
+    return Outcomes(system, links, found, errors, records)
 
 
-class Enumerated(NamedTuple):
-    """All outcomes of a scenario before any number is put in.
+@dataclass(frozen=True)
+class _Asked:
+    """All that outcomes under one µ depend on; equal where that is.
 
     Parameters
     ----------
-    groups : agents that are alike.
-    structure : the outcomes.
-    made : the estimator that has written them down, and what its values claim.
-    weights : bookkeeping of probabilities.
+    structure : agents, links and starts without their numbers.
+    system, how : one of those that have it.
     """
 
-    groups: tuple[tuple[int, ...], ...]
-    structure: Structure
-    made: Made
-    weights: Any
+    structure: tuple[Any, ...]
+    errors: bool
+    system: System = field(compare=False)
+    how: Settings = field(compare=False)
+
+    @classmethod
+    def of(cls, system: System, how: Settings, errors: bool) -> _Asked:
+        estimator = (how.estimator, how.max_graphs, how.criterion)
+        # what is not a sum of information may look at numbers of the system while it writes down pasts
+        own = () if how.estimator in SUMS else (id(system),)
+        return cls((*system.same_structure(), *estimator, *own), errors, system, how)
 
 
-def enumerated(
-    scenario: Scenario,
-    rows: LinkRows,
-    estimator: str,
+@lru_cache(maxsize=KEPT)
+def _kept(asked: _Asked) -> Enumerated:
+    network = asked.system.network
+    return _enumerated(asked.system, restricted(uniform_rows([0.5]), network), asked.how, errors=asked.errors)
+
+
+def _enumerated(
+    system: System,
+    links: LinkRows,
+    how: Settings,
     *,
     records: np.ndarray | None = None,
     errors: bool = False,
-    max_graphs: int = 100_000,
-    prune: bool = False,
     plain: bool = False,
-    criterion: str = "det",
-    progress: Progress | None = None,
-    polynomial: bool = False,
 ) -> Enumerated:
-    """Enumerate all outcomes of a scenario; parameters and errors are those of `outcomes`.
-
-    Parameters
-    ----------
-    polynomial : count successes although links differ: those that there are, are equally likely.
-    """
-    network = scenario.network
+    """Enumerate all outcomes; parameters and errors are those of `outcomes`."""
+    network = system.network
     check_size(network)
     # records tell like agents apart
-    kinds = scenario.kind_of if records is None else tuple(range(network.agents))
-    permutations = relabellings(network, rows, kinds)
+    kinds = system.labels if records is None else tuple(range(network.agents))
+    permutations = relabellings(network, links, kinds)
     # a bursty link keeps its state where it is: nobody may change places
-    fixed = plain or rows.bursts is not None
+    fixed = plain or links.bursts is not None
     made = make(
-        scenario, estimator, None if fixed else permutations, errors=errors, records=records, criterion=criterion
+        system,
+        how.estimator,
+        None if fixed else permutations,
+        errors=errors,
+        records=records,
+        criterion=how.criterion,
     )
-    per_step = [events(network, rows, step) for step in range(1, network.steps + 1)]
-    if rows.bursts is not None:
-        weights = bursty(per_step[0], len(rows.link))
+    per_step = [events(network, links, step) for step in range(1, network.steps + 1)]
+    if links.bursts is not None:
+        weights = bursty(per_step[0], len(links.link))
+    elif how.prune or links.common(network) is None:
+        weights = Rows(len(links.link))
     else:
-        alike = uniform_rows([0.5]) if polynomial else rows
-        weights = Rows(len(rows.link)) if prune else weights_for(network, alike, sum(map(len, per_step)))
-    groups = groups_alike(network, rows, kinds, permutations)
+        weights = weights_for(network, sum(map(len, per_step)))
+    groups = groups_alike(network, links, kinds, permutations)
     request = Request(
         agents=network.agents,
         steps=network.steps,
@@ -414,11 +569,117 @@ def enumerated(
         events=lambda step: per_step[step - 1],
         weights=weights,
         groups=groups,
-        most=max_graphs,
-        prune=prune,
+        most=how.max_graphs,
+        prune=how.prune,
         plain=plain,
     )
-    return Enumerated(groups, enumerate_outcomes(made.estimator, request, progress), made, weights)
+    return Enumerated(groups, enumerate_outcomes(made.estimator, request, how.progress), made, weights)
+
+
+def _over_items(system: System, link: np.ndarray, items: Items, how: Settings, errors: bool) -> Averaged:
+    """Average sums of information for items with noises of their own, every item's claims weighed at its own µ."""
+    P0 = system.P0 if items.noises.P0 is None else items.noises.P0
+    noises = items.noises._replace(P0=np.broadcast_to(P0, (len(items), *system.P0.shape)))
+    # the system's own first covariance is not used, and may be one that has no inverse
+    plain = system.with_noises(Noises(P0=np.eye(system.dimension)))
+    found = _kept(_Asked.of(plain, how, errors))
+    batch = _Batch(system, found, errors)
+    # items with the same noises side by side, so that a block of them has few different ones
+    order = np.argsort(noises.different()[1], kind="stable")
+    size = max(1, BLOCK // (len(found.made.estimator.ledger.sums) * batch.numbers))
+    parts, far = [], []
+    for first in range(0, len(order), size):
+        some = order[first : first + size]
+        try:
+            block, reached = batch.block(link[some], noises.take(some))
+        except NoAnswerError as error:
+            raise NoAnswerError(str(error), some[list(error.items)].tolist()) from None
+        parts.append(block)
+        far.append(reached)
+    back = np.argsort(order)
+    rounding = np.concatenate(far)[back]
+    of = Moments(*(None if m[0] is None else np.concatenate(m)[back] for m in zip(*parts, strict=True)))
+    return Averaged(
+        moments=of,
+        group_of=group_of(found.groups),
+        natures=np.where(rounding > PROMISED, "approximate", "exact"),
+        estimator=how.estimator,
+        rounding=rounding,
+        meta={"outcomes": found.structure.outcomes[-1], "graphs": found.structure.states},
+    )
+
+
+class _Batch(NamedTuple):
+    """Items with noises of their own, side by side."""
+
+    system: System
+    found: Enumerated
+    errors: bool
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers information and footprint of one value take."""
+        d, n, steps = self.system.dimension, self.system.agents, self.system.steps
+        p = sum(self.system.sensors[kind].H.shape[-2] for kind in self.system.sensor_of)
+        return d * (d + self.errors * (n * d + (steps - 1) * (d + p) + 1))
+
+    def block(self, link: np.ndarray, noises: Noises) -> tuple[Moments, np.ndarray]:
+        """Moments (items, steps, groups, …), and how far rounding may reach in each item."""
+        first, of = noises.different()
+        different = noises.take(first)
+        try:
+            found, magnified = self._moments(link, of, self._claims(different, None))
+        except NoAnswerError as error:
+            raise NoAnswerError(str(error), np.flatnonzero(np.isin(of, error.items)).tolist()) from None
+        far, suspect = 2e-16 * magnified, np.flatnonzero(suspects(self.system, different)[of])
+        if len(suspect):
+            theirs = found.map(lambda m: m[suspect])
+            again = partial(self._changes, link[suspect], noises.take(suspect), theirs)
+            far[suspect] = np.maximum(far[suspect], reach(again))
+        return found, far
+
+    def _claims(self, noises: Noises, seed: int | None) -> InformationClaims:
+        given = sources(self.system, noises, self.errors)
+        ledger = self.found.made.estimator.ledger
+        return InformationClaims(evaluate(ledger, given if seed is None else MovedSources(given, seed)))
+
+    def _moments(self, link: np.ndarray, of: np.ndarray, values: Claims) -> tuple[Moments, np.ndarray]:
+        """Moments (items, steps, groups, …), and by how much rounding grew in the last inversion of each item.
+
+        Parameters
+        ----------
+        of : which of the noises each item has.
+        """
+        magnified, steps = np.ones(len(of)), []
+        for step in range(1, self.system.steps + 1):
+            expected: list[Any] = [None] * len(Moments._fields)
+            for weights, estimate, grown in self.found.shared_out(step, values):
+                magnified = np.maximum(magnified, np.atleast_1d(grown)[of])
+                probability = monomials(weights.shape[1] - 1, link) @ weights
+                for place, each in enumerate((moments if self.errors else claimed_only)(estimate)):
+                    if each is not None:
+                        part = np.einsum("giv,vi...->ig...", probability, each[:, of])
+                        expected[place] = part if expected[place] is None else expected[place] + part
+            steps.append(expected)
+        return Moments(*(None if m[0] is None else np.stack(m, axis=1) for m in zip(*steps, strict=True))), magnified
+
+    def _changes(self, link: np.ndarray, noises: Noises, found: Moments, seed: int) -> np.ndarray:
+        """By how much moved numbers change each item's moments, (items,)."""
+        first, of = noises.different()
+        try:
+            moved, _ = self._moments(link, of, self._claims(noises.take(first), seed))
+        except (StochfuseError, np.linalg.LinAlgError):
+            if len(link) == 1:
+                return np.array([NO_DIGIT])
+            # halves, until those are found of which no digit is left
+            half = len(link) // 2
+            parts = [
+                self._changes(link[some], noises.take(some), found.map(lambda m: m[some]), seed)  # noqa: B023
+                for some in (np.s_[:half], np.s_[half:])
+            ]
+            return np.concatenate(parts)
+        pairs = [(found.P, moved.P), (found.actual, moved.actual), (found.square, moved.square)]
+        return np.max([change(P, M).max(axis=(1, 2)) for P, M in pairs if P is not None and M is not None], axis=0)
 
 
 def groups_alike(

@@ -1,4 +1,10 @@
-"""The exact expected optimum of a scenario, theory section 6: what no fusion rule can beat."""
+"""The exact expected optimum, theory section 6: what no fusion rule can beat.
+
+The contact chain (`stochfuse.engines.contact_chain`) has one path for every history of counts, the same for every item.
+The filter runs along each path, in square-root form, once for all items or, where they have noises of their own, for
+each of them; every item's paths are weighed with its own link probabilities.  Where paths are too many for that, the
+optimum is enclosed in bounds (`stochfuse.engines.enclosure`).
+"""
 
 from __future__ import annotations
 
@@ -8,53 +14,112 @@ import numpy as np
 
 from stochfuse.engines.contact_chain import (
     Chain,
+    Contacts,
     Filter,
     TooManyPathsError,
+    by_counts,
     check_size,
     contacts,
     expected_optimum,
+    joined,
     number_of_paths,
+    over_paths,
 )
 from stochfuse.engines.enclosure import enclosed_optimum
 from stochfuse.engines.events import relabellings
-from stochfuse.engines.precision import Moving, change, reach, suspects
+from stochfuse.engines.precision import PROMISED, Moving, change, notes, reach, suspects
+from stochfuse.errors import UsageError
+from stochfuse.kalman.metrics import Moments
 from stochfuse.prediction.general import groups_alike
-from stochfuse.scenario.model import Noises
+from stochfuse.prediction.method import Averaged, Settings, group_of
+from stochfuse.prediction.method import joined as joined_items
+from stochfuse.scenario.model import Model, Sensor
 from stochfuse.scenario.network import LinkRows
-from stochfuse.scenario.scenario import Scenario, require_independent_noise, require_one_state
+from stochfuse.scenario.system import Items, Noises, System
+
+BLOCK = 1 << 19
+"""Numbers that covariances, weights or transitions of a block of items take."""
+NAME = "optimal"
 
 
-def optimum(scenario: Scenario, rows: LinkRows) -> tuple[Chain, tuple[tuple[int, ...], ...]]:
-    """Return the expected optimum by the contact chain, and the groups of agents that it holds for.
-
-    Exact where the chain's paths can be gone through one by one, else enclosed in bounds.
+def averaged(system: System, items: Items, how: Settings, errors: bool) -> Averaged:
+    """Return the expected optimum by the contact chain; parameters are those of every method, see `Averaged`.
 
     Raises
     ------
     UsageError
         If the chain's states or paths are too many.
     """
-    network = scenario.network
-    groups = groups_of(scenario, rows)
-    chain, given = contacts(network, rows, scenario.sensor_of, groups), filter_of(scenario)
-    plain = counted(scenario, rows)
-
-    def every_path(given: Filter) -> Chain:
-        return expected_optimum(given, chain, network.steps, len(rows.link))
-
-    def bounds(given: Filter) -> Chain:
-        return enclosed_optimum(given, chain, network.steps, len(rows.link))
-
-    go = every_path
+    links, network = items.links, system.network
+    groups = groups_of(system, links)
+    chain = contacts(network, links, system.sensor_of, groups)
+    paths = number_of_paths(network) if counted(system, links) else None
     try:
-        if plain:
-            check_size(number_of_paths(network))
-        found = every_path(given)
+        if paths is not None:
+            check_size(paths)
+        found = _every_path(system, items, chain, paths)
     except TooManyPathsError:
-        found, go = bounds(given), bounds
-    if suspects(scenario, Noises(P0=scenario.P0[None])).any():
-        found = found._replace(rounding=float(rounding(given, found, go).max()))
-    return found._replace(paths=number_of_paths(network)) if plain else found, groups
+        if not items.noises.common:
+            return joined_items([(m, averaged(alone, some, how, errors)) for m, alone, some in items.by_noises(system)])
+        found = _with_rounding(system, Noises(), lambda given: enclosed_optimum(given, chain, system.steps, len(items)))
+    if errors and found.bias is None:
+        raise UsageError("the optimum is only enclosed in bounds: expected quantity optimal, or fewer agents or steps")
+    bound, far = float(found.bound.max()), np.broadcast_to(found.rounding, len(items))
+    said = [f"the optimum is proved to lie within a relative {bound:.0e} of the value shown"] if bound else []
+    return Averaged(
+        # what the optimum claims is what it achieves
+        moments=Moments(found.P, found.P, found.bias, found.square) if errors else Moments(found.P),
+        group_of=group_of(groups),
+        natures=np.where(far > PROMISED, "approximate", "bound" if bound else "exact"),
+        estimator=NAME,
+        rounding=far,
+        notes=(*said, *notes(float(far.max()))),
+        meta={"paths": found.paths if paths is None else paths, "relative_bound": found.bound.tolist()},
+    )
+
+
+def _every_path(system: System, items: Items, chain: Contacts, paths: int | None) -> Chain:
+    """Go through every path, for items with noises of their own a few at a time."""
+    steps, own = system.steps, items.noises
+    if own.common:
+        return _with_rounding(system, own, lambda given: expected_optimum(given, chain, steps, len(items)))
+    noises = own._replace(P0=np.broadcast_to(system.P0 if own.P0 is None else own.P0, (len(items), *system.P0.shape)))
+    size = _items(chain, _paths_of(system, chain) if paths is None else paths, system.dimension)
+    blocks = [np.arange(first, min(first + size, len(items))) for first in range(0, len(items), size)]
+
+    def block(some: np.ndarray) -> Chain:
+        def go(given: Filter, places: np.ndarray = some) -> Chain:
+            return joined([over_paths(given, chain, steps, places)])
+
+        return _with_rounding(system, noises.take(some), go, some)
+
+    found = [block(some) for some in blocks]
+    P, b, M, bound, rounding = (
+        np.concatenate([getattr(f, name) for f in found]) for name in ("P", "bias", "square", "bound", "rounding")
+    )
+    return Chain(P, b, M, bound, found[0].paths, rounding)
+
+
+def _with_rounding(system: System, noises: Noises, go: Callable[..., Chain], places: np.ndarray | None = None) -> Chain:
+    """Find the optimum, and how far rounding may reach in it, (rows,).
+
+    Parameters
+    ----------
+    go : finds the optimum of a filter; of noises of items' own, of the items at some places.
+    places : of the items, where they have noises of their own.
+    """
+    found = go(filter_of(system.with_noises(noises)))
+    far = np.zeros(len(found.P))
+    suspect = np.flatnonzero(suspects(system, noises if noises.P0 is not None else Noises(P0=system.P0[None])))
+    if not len(suspect):
+        return found._replace(rounding=far)
+    if places is None:
+        return found._replace(rounding=far + rounding(filter_of(system), found, go))
+    P, b, M, bound = (m if m is None else m[suspect] for m in found[:4])
+    theirs = found._replace(P=P, bias=b, square=M, bound=bound)
+    moved = filter_of(system.with_noises(noises.take(suspect)))
+    far[suspect] = rounding(moved, theirs, lambda given: go(given, places[suspect]))
+    return found._replace(rounding=far)
 
 
 def rounding(given: Filter, found: Chain, go: Callable[[Filter], Chain]) -> np.ndarray:
@@ -73,31 +138,37 @@ def rounding(given: Filter, found: Chain, go: Callable[[Filter], Chain]) -> np.n
     return np.broadcast_to(reach(again), len(found.P))
 
 
-def groups_of(scenario: Scenario, rows: LinkRows) -> tuple[tuple[int, ...], ...]:
-    """Return the agents that are alike, whose optimum is the same.
-
-    Raises
-    ------
-    UsageError
-        If the contact chain is not one for such a scenario.
-    """
-    require_one_state(scenario, "the optimum")
-    require_independent_noise(scenario, "the optimum")
-    network, kinds = scenario.network, scenario.sensor_of
-    if _alike(scenario, rows):
+def groups_of(system: System, links: LinkRows) -> tuple[tuple[int, ...], ...]:
+    """Return the agents that are alike, whose optimum is the same."""
+    network, kinds = system.network, system.sensor_of
+    if _alike(system, links):
         return (tuple(range(network.agents)),)
-    return groups_alike(network, rows, kinds, relabellings(network, rows, kinds))
+    return groups_alike(network, links, kinds, relabellings(network, links, kinds))
 
 
-def filter_of(scenario: Scenario) -> Filter:
+def filter_of(system: System) -> Filter:
     """Return the filter of an agent that loses nothing."""
-    return Filter(scenario.model, scenario.sensors, scenario.P0, scenario.correlation == "shared", scenario.error)
+    return Filter(system.model, system.sensors, system.P0, system.shared, system.error)
 
 
-def counted(scenario: Scenario, rows: LinkRows) -> bool:
-    """Whether `number_of_paths` is that of the scenario's chain."""
-    return _alike(scenario, rows) and scenario.network.delay == (1.0,) and rows.bursts is None
+def counted(system: System, links: LinkRows) -> bool:
+    """Whether `number_of_paths` is that of the system's chain."""
+    return _alike(system, links) and system.network.delay == (1.0,) and links.bursts is None
 
 
-def _alike(scenario: Scenario, rows: LinkRows) -> bool:
-    return len(set(scenario.sensor_of)) == 1 and rows.uniform
+def _alike(system: System, links: LinkRows) -> bool:
+    return len(set(system.sensor_of)) == 1 and links.uniform
+
+
+def _paths_of(system: System, chain: Contacts) -> int:
+    """How many paths the chain has, followed with the simplest of filters for one row."""
+    one = np.ones((1, 1))
+    sensors = [Sensor(one, one)] * len(set(system.sensor_of))
+    simplest = Filter(Model(one, one, 0 * one, ("x",), ("",)), sensors, one, False)
+    return over_paths(simplest, chain, system.steps, slice(0, 1))[1]
+
+
+def _items(chain: Contacts, paths: int, dimension: int) -> int:
+    """How many items are worked on at a time."""
+    states = max(len(here) for here in by_counts(chain)[1])
+    return max(1, BLOCK // max(len(chain.held) ** 2, paths * states, paths * dimension**2))

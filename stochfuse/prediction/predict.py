@@ -1,66 +1,42 @@
-"""The methods by the names that users ask for."""
+"""The methods by the names that users ask for: one request, any method, a prediction.
+
+    predict           one scenario against link probabilities
+    predict_several   several quantities of it
+    predict_many      many scenarios that differ in link probability and noises
+
+All three make `Items` of a `System` and ask one method for their moments.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from stochfuse.engines import precision as conditioning
-from stochfuse.engines.precision import PROMISED, lost
-from stochfuse.errors import UsageError
-from stochfuse.kalman.metrics import Moments
-from stochfuse.prediction import simplified
+from stochfuse.engines.precision import told
+from stochfuse.errors import StochfuseError, UsageError
+from stochfuse.kalman.checks import covariance_fault
+from stochfuse.prediction import general, optimal, sampled, simplified, states
+from stochfuse.prediction.method import RUNS, Averaged, Settings, faults_of
 from stochfuse.prediction.quantities import QUANTITIES
 from stochfuse.prediction.result import Prediction
+from stochfuse.prediction.steady_state import steady_state
 from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.registry import CRITERIA, ESTIMATORS, METHODS
 from stochfuse.scenario.scenario import Scenario, link_rows
+from stochfuse.scenario.system import Items, Noises, System
 
-MOST_GRAPHS = 100_000
-RUNS, SEED = 1000, 1
 LFG = "local-fusion-graph"
-SELF_CONSISTENT = (
-    "the simplified formulation takes for granted that agents share the broadcast prior and nothing else: by its own "
-    "assumptions the actual covariance is the claimed one; for what is true see method general"
-)
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How a method goes about its work.
-
-    Parameters
-    ----------
-    estimator : what the agents do with what arrives (general and monte-carlo), one of `ESTIMATORS`, see
-        `stochfuse.estimators.making`.
-    max_graphs : general, naive: different graphs that may be carried from step to step.
-    prune : general, naive: leave the least likely graphs out where there are more, instead of giving up.
-    runs, seed : monte-carlo: independent runs per link probability, and the seed.
-    workers : monte-carlo: processes; default: one for small samples, else one per processor.
-    criterion : covariance-intersection, split-ci: what the weights minimise, "det", "trace" or "max-eig",
-        in each fusion by itself: over several steps that need not be the least.
-    progress : told how far long work is, see `stochfuse.engines.enumeration.Progress`.
-    """
-
-    estimator: str = "local-fusion-graph"
-    max_graphs: int = MOST_GRAPHS
-    prune: bool = False
-    runs: int = RUNS
-    seed: int = SEED
-    workers: int | None = None
-    criterion: str = "det"
-    progress: Any = None
-
-
 NAIVE = "naive fusion counts shared information again and believes it; quantity actual is its true error"
 CENTRE = (
     "what agents measure themselves reaches the centre of ITNS without a link, only agreement between them depends on "
     "the links: not to be compared with the optimum of what arrived"
 )
 NO_ERROR = "the scenario has no known initial error (initial.error): the bias is 0, the RMS error that of the noise"
+WORTHLESS = 1e-3
+"""Relative rounding beyond which it is no answer."""
 
 
 def predict(
@@ -106,49 +82,19 @@ def predict(
     NoAnswerError
         If a steady state is asked for and there is none.
     """
-    method = method or scenario.method or "simplified"
-    choose("method", method, METHODS)
-    choose("quantity", quantity, QUANTITIES)
-    unknown = set(settings) - set(Settings.__dataclass_fields__)
-    if unknown:
-        raise TypeError(f"predict() got an unexpected keyword argument '{sorted(unknown)[0]}'")
-    how = Settings(**{"estimator": scenario.estimator or LFG, "runs": scenario.runs or RUNS, **settings})
-    choose("estimator", how.estimator, ESTIMATORS)
-    choose("criterion", how.criterion, CRITERIA)
+    method, how = _asked(scenario, method, quantity, settings)
     if steady and method != "simplified":
         raise UsageError(f"steady: expected method simplified, got {method}")
     if steady and quantity != "claimed":
         raise UsageError(f"steady: expected quantity claimed, got {quantity}")
     rows = link_rows(scenario, link)
-    if quantity == "optimal":
-        method, how = ("monte-carlo" if method == "monte-carlo" else "optimal"), replace(how, estimator="optimal")
-    errors = quantity not in ("claimed", "optimal")
-    make: dict[str, Callable[[], dict[str, Any]]] = {
-        "simplified": lambda: _simplified(scenario, rows, errors),
-        "general": lambda: _enumerated(scenario, rows, how, how.estimator, errors),
-        "naive": lambda: _enumerated(scenario, rows, how, "naive", errors),
-        "optimal": lambda: _optimal(scenario, rows, errors),
-        "monte-carlo": lambda: _sampled(scenario, rows, how, errors),
-    }
-    parts = make[method]()
-    if parts.get("estimator") == "itns" and not scenario.own:
-        parts["notes"] = (*parts["notes"], CENTRE)
-    if quantity in ("bias", "rms") and scenario.error is None:
-        parts["notes"] = (*parts["notes"], NO_ERROR)
-    prediction = Prediction(
-        scenario=scenario,
-        method=method,
-        quantity="optimal" if method == "optimal" and quantity == "claimed" else quantity,
-        stage="posterior",
-        link=rows.means(scenario.network),
-        cases=rows.names,
-        steps=np.arange(1, scenario.network.steps + 1),
-        **parts,
-    )
+    found = _averaged(scenario.system, Items(rows), method, how, quantity)
+    if found.faults:
+        item, why = min(found.faults.items())
+        raise StochfuseError(f"method {method}: {why} (link probability {rows.means(scenario.network)[item]:g})")
+    prediction = _prediction(scenario, rows, method, quantity, found)
     if not steady:
         return prediction
-    from stochfuse.prediction.steady_state import steady_state
-
     fixed = steady_state(scenario, rows)
     return prediction.with_steady(fixed.P, fixed.bound)
 
@@ -177,130 +123,206 @@ def predict_several(
     return [found[q] for q in quantities]
 
 
-def _simplified(scenario: Scenario, rows: LinkRows, errors: bool) -> dict[str, Any]:
-    result = simplified.covariances(scenario, rows)
-    moments, notes = Moments(result.P), simplified.departures(scenario, rows)
-    if "square-root" in result.forms or conditioning.ill_noise(scenario):
-        notes += _rounding(simplified.reach_of_rounding(scenario, rows))
-    if errors:
-        from stochfuse.prediction.states import mean_error
+@dataclass(frozen=True, eq=False)
+class Many:
+    """What became of many scenarios.
 
-        # one agent of each group stands for all of it
-        first = np.unique(result.group_of, return_index=True)[1]
-        moments = Moments.of(result.P, result.P, mean_error(scenario, rows)[:, :, first])
-        notes.append(SELF_CONSISTENT)
-    return {
-        "nature": "approximate",
-        "moments": moments,
-        "group_of": result.group_of,
-        "forms": result.forms,
-        "notes": tuple(notes),
-    }
+    Parameters
+    ----------
+    predictions : one per quantity, with the items in the place of link probabilities.
+    natures : (items,) "exact", "approximate", "bound" or "sampled".
+    faults : reason why an item has no answer, by its place.
+    """
+
+    predictions: list[Prediction]
+    natures: np.ndarray
+    faults: Mapping[int, str]
 
 
-def _rounding(reach: np.ndarray) -> list[str]:
-    """Say how far rounding may reach in some row of the simplified formulation, where that is too far."""
-    far = lost(reach)
-    return [conditioning.told(float(reach[far].max()))] if far.any() else []
+def predict_many(
+    scenario: Scenario,
+    link: Any = None,
+    Q: Any = None,
+    R: Any = None,
+    P: Any = None,
+    method: str | None = None,
+    quantity: str = "claimed",
+    **settings: Any,
+) -> Prediction:
+    """Predict many scenarios that differ in link probability and noises only, in one call.
+
+    Parameters
+    ----------
+    scenario : what they have in common.
+    link : (items,) link probability of each, the same for all links and steps; default: the scenario's.
+    Q : (items, d, d) process noise of each, as it enters the state, at all steps; or (items,) for multiples of the
+        identity.  Default: the scenario's.
+    R : (items, p, p) measurement noise of each, of every agent; or (items,).
+    P : (items, d, d) covariance of the first estimates of each; or (items,).
+    method, quantity, **settings : as for `predict`.
+
+    Returns
+    -------
+    Prediction
+        With the items in the place of link probabilities; not-a-number for an item that has no answer, and why in
+        meta["faults"].
+
+    Raises
+    ------
+    UsageError
+        If an array does not fit, or the method does not take the scenario.
+    """
+    items = items_of(scenario, link, Noises(Q, R, P))
+    found = predict_items(scenario, items, method, [quantity], **settings)
+    (prediction,) = found.predictions
+    without = np.zeros(len(items), dtype=bool)
+    without[list(found.faults)] = True
+
+    def blank(M: np.ndarray) -> np.ndarray:
+        return np.where(without.reshape(-1, *(1,) * (M.ndim - 1)), np.nan, M)
+
+    moments = prediction.moments.map(blank) if found.faults else prediction.moments
+    return replace(prediction, moments=moments, meta={**prediction.meta, "faults": dict(found.faults)})
 
 
-def _enumerated(scenario: Scenario, rows: LinkRows, how: Settings, estimator: str, errors: bool) -> dict[str, Any]:
-    from stochfuse.prediction.general import outcomes
+def predict_items(
+    scenario: Scenario, items: Items, method: str | None, quantities: Sequence[str], **settings: Any
+) -> Many:
+    """Predict several quantities of many items, with no more work than the hardest of them needs.
 
-    if how.max_graphs < 1:
-        raise UsageError(f"max_graphs: expected a whole number of at least 1, got {how.max_graphs}")
-    found = outcomes(
-        scenario,
-        rows,
-        estimator,
-        errors=errors,
-        max_graphs=how.max_graphs,
-        prune=how.prune,
-        criterion=how.criterion,
-        progress=how.progress,
+    Raises
+    ------
+    UsageError, NoAnswerError
+        As `predict`, if that would raise it for one item; a NoAnswerError names such items where they are known.
+    """
+    predictions, faults, natures = {}, {}, []
+    for some, hardest in _together(method or scenario.method or "simplified", quantities):
+        way, how = _asked(scenario, method, hardest, settings)
+        found = _averaged(scenario.system, items, way, how, hardest)
+        first = _prediction(scenario, items.links, way, hardest, found)
+        predictions |= {q: first if q == hardest else first.shown_as(q) for q in some}
+        lost = {int(i): told(found.rounding[i]) for i in np.flatnonzero(found.rounding > WORTHLESS)}
+        faults |= {**faults_of(found.moments), **lost, **found.faults}
+        natures.append(found.natures)
+    certain = ("exact", "sampled", "approximate", "bound")
+    worst = np.max([np.vectorize(certain.index, otypes=[int])(nature) for nature in natures], axis=0)
+    return Many([predictions[q] for q in quantities], np.array(certain)[worst], faults)
+
+
+def items_of(scenario: Scenario, link: Any, noises: Noises) -> Items:
+    """Return items of link probabilities and noises, checked.
+
+    Raises
+    ------
+    UsageError
+        If they do not fit the scenario, or each other.
+    """
+    d, widths = scenario.model.dimension, {s.H.shape[-2] for s in scenario.sensors}
+    if noises.R is not None and len(scenario.sensors) > 1:
+        raise UsageError("R: expected like sensors to have a noise of the item's own, got unlike ones ([[agent]] H, R)")
+    checked = Noises(
+        _stack("Q", noises.Q, d), _stack("R", noises.R, max(widths), definite=True), _stack("P", noises.P0, d)
     )
-    left_out = float(found.left_out.max())
-    notes = [] if errors or estimator != "naive" else [NAIVE]
-    if left_out > 1e-12:
-        row, step = np.unravel_index(found.left_out.argmax(), found.left_out.shape)
-        notes.append(
-            f"outcomes of probability up to {left_out:.2g} (at µ = {rows.means(scenario.network)[row]:g}, step "
-            f"{step + 1}) are "
-            "left out; what is shown holds given one of the others"
-        )
-    moments, reach = found.moments(), found.rounding
-    notes += conditioning.notes(reach)
-    return {
-        "nature": "exact" if left_out <= 1e-12 and reach <= PROMISED else "approximate",
-        "moments": moments,
-        "group_of": group_of(found.groups),
-        "estimator": estimator,
-        "notes": tuple(notes),
-        "outcomes": found,
-        "meta": {
-            "outcomes": found.structure.outcomes[-1],
-            "graphs": found.structure.states,
-            "left_out": found.left_out.tolist(),
-        },
+    sizes = {name: len(M) for name, M in zip(("Q", "R", "P"), checked, strict=True) if M is not None}
+    if link is not None or not sizes:
+        rows = link_rows(scenario, link)
+    else:
+        rows = link_rows(scenario)
+        if len(rows.link) != 1:
+            raise UsageError("link: expected one link probability per item, since the scenario has none of its own")
+    items = max([len(rows.link) if link is not None else 1, *sizes.values()])
+    if len(rows.link) == 1 and items > 1:
+        rows = rows.take(np.zeros(items, dtype=int))
+    for name, size in {"link": len(rows.link), **sizes}.items():
+        if size != items:
+            raise UsageError(f"{name}: expected {items} items, as many as the other arrays have, got {size}")
+    return Items(rows, checked)
+
+
+def _stack(name: str, given: Any, n: int, *, definite: bool = False) -> np.ndarray | None:
+    """Covariances (items, n, n), or numbers (items,) that multiply the identity, checked."""
+    if given is None:
+        return None
+    expected = f"an array of shape (items, {n}, {n}), or (items,)"
+    try:
+        M = np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        raise UsageError(f"{name}: expected {expected}, got {type(given).__name__}") from None
+    M = M[:, None, None] * np.eye(n) if M.ndim == 1 else M
+    if M.ndim != 3 or M.shape[1:] != (n, n):
+        raise UsageError(f"{name}: expected {expected}, got {np.shape(given)}")
+    fault = covariance_fault(M, definite=definite)
+    if fault is not None:
+        raise UsageError(f"{name}: expected covariances, got {fault}")
+    return M
+
+
+def _together(method: str, quantities: Sequence[str]) -> list[tuple[list[str], str]]:
+    """Quantities that one calculation gives together, and the hardest of each."""
+    apart = [q for q in quantities if q == "optimal" and method != "optimal"]
+    together = [q for q in quantities if q not in apart]
+    # the moments of the actual error contain what is claimed; bias and rms have more to note
+    order = ("claimed", "optimal", "actual", "consistency", "bias", "rms")
+    return [(some, max(some, key=order.index)) for some in (together, apart) if some]
+
+
+def _asked(scenario: Scenario, method: str | None, quantity: str, settings: Mapping[str, Any]) -> tuple[str, Settings]:
+    """Method and settings of a request, checked."""
+    method = method or scenario.method or "simplified"
+    choose("method", method, METHODS)
+    choose("quantity", quantity, QUANTITIES)
+    unknown = set(settings) - set(Settings.__dataclass_fields__)
+    if unknown:
+        raise TypeError(f"predict() got an unexpected keyword argument '{sorted(unknown)[0]}'")
+    how = Settings(**{"estimator": scenario.estimator or LFG, "runs": scenario.runs or RUNS, **settings})
+    choose("estimator", how.estimator, ESTIMATORS)
+    choose("criterion", how.criterion, CRITERIA)
+    if quantity == "optimal":
+        method, how = ("monte-carlo" if method == "monte-carlo" else "optimal"), replace(how, estimator="optimal")
+    return method, replace(how, estimator="naive") if method == "naive" else how
+
+
+def _averaged(system: System, items: Items, method: str, how: Settings, quantity: str) -> Averaged:
+    errors = quantity not in ("claimed", "optimal")
+    engines: dict[str, Callable[[], Averaged]] = {
+        "simplified": lambda: simplified.averaged(system, items),
+        "general": lambda: general.averaged(system, items, how, errors),
+        "naive": lambda: general.averaged(system, items, how, errors),
+        "optimal": lambda: optimal.averaged(system, items, how, errors),
+        "monte-carlo": lambda: sampled.averaged(system, items, how, errors),
     }
+    found = engines[method]()
+    if method == "simplified" and errors:
+        found = states.with_errors(system, items, found)
+    first = [NAIVE] if how.estimator == "naive" and method in ("general", "naive") and not errors else []
+    said = []
+    if found.estimator == "itns" and not system.own:
+        said.append(CENTRE)
+    if quantity in ("bias", "rms") and system.error is None:
+        said.append(NO_ERROR)
+    return found._replace(notes=(*first, *found.notes, *said))
 
 
-def _optimal(scenario: Scenario, rows: LinkRows, errors: bool) -> dict[str, Any]:
-    from stochfuse.prediction.optimal import optimum
-
-    found, groups = optimum(scenario, rows)
-    bound = float(found.bound.max())
-    notes = [f"the optimum is proved to lie within a relative {bound:.0e} of the value shown"] if bound else []
-    notes += conditioning.notes(found.rounding)
-    moments = Moments(found.P)
-    if errors:
-        if found.bias is None:
-            raise UsageError(
-                "the optimum is only enclosed in bounds: expected quantity optimal, or fewer agents or steps"
-            )
-        # what the optimum claims is what it achieves
-        moments = Moments(found.P, found.P, found.bias, found.square)
-    return {
-        "nature": "approximate" if found.rounding > PROMISED else "bound" if bound else "exact",
-        "moments": moments,
-        "group_of": group_of(groups),
-        "estimator": "optimal",
-        "notes": tuple(notes),
-        "meta": {"paths": found.paths, "relative_bound": found.bound.tolist()},
-    }
-
-
-def _sampled(scenario: Scenario, rows: LinkRows, how: Settings, errors: bool) -> dict[str, Any]:
-    from stochfuse.prediction.sampled import sampled
-
-    found = sampled(
-        scenario,
-        rows,
-        how.estimator,
-        errors=errors,
-        runs=how.runs,
-        seed=how.seed,
-        workers=how.workers,
-        criterion=how.criterion,
-        progress=how.progress,
+def _prediction(scenario: Scenario, rows: LinkRows, method: str, quantity: str, found: Averaged) -> Prediction:
+    certain = ("exact", "sampled", "bound", "approximate")
+    return Prediction(
+        scenario=scenario,
+        method=method,
+        quantity="optimal" if method == "optimal" and quantity == "claimed" else quantity,
+        stage="posterior",
+        nature=max(map(str, found.natures), key=certain.index),
+        link=rows.means(scenario.network),
+        cases=rows.names,
+        steps=np.arange(1, scenario.network.steps + 1),
+        moments=found.moments,
+        group_of=found.group_of,
+        forms=found.forms,
+        notes=found.notes,
+        estimator=found.estimator,
+        outcomes=found.outcomes,
+        sampled=found.sampled,
+        meta=found.meta,
     )
-    return {
-        "nature": "sampled",
-        "notes": (),
-        "moments": found.moments(),
-        "group_of": group_of(found.groups),
-        "estimator": how.estimator,
-        "sampled": found,
-        "meta": {"runs": how.runs, "seed": how.seed},
-    }
-
-
-def group_of(groups: Sequence[tuple[int, ...]]) -> np.ndarray:
-    """Index of every agent among groups of agents."""
-    index = np.zeros(sum(map(len, groups)), dtype=int)
-    for group, agents in enumerate(groups):
-        index[list(agents)] = group
-    return index
 
 
 def choose(name: str, value: str, choices: Sequence[str]) -> None:

@@ -9,6 +9,7 @@ by the metric's derivative at the mean (delta method), taken by central differen
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -16,15 +17,16 @@ import numpy as np
 
 from stochfuse.engines.events import events, relabellings
 from stochfuse.engines.monte_carlo import Experiment, Sample, sample
-from stochfuse.engines.progress import Progress
 from stochfuse.errors import UsageError
 from stochfuse.estimators.making import make
+from stochfuse.estimators.protocol import Claims, Estimator
 from stochfuse.estimators.world import claimed_only, moments
 from stochfuse.kalman.metrics import Metric, Moments
 from stochfuse.prediction.general import groups_alike
+from stochfuse.prediction.method import Averaged, Settings, group_of, joined
 from stochfuse.prediction.quantities import needed, value
 from stochfuse.scenario.network import LinkRows
-from stochfuse.scenario.scenario import Scenario
+from stochfuse.scenario.system import Items, Noises, System
 
 MOST_AGENTS, MOST_NUMBERS = 60, 500_000_000
 """Agents whose sets fit a machine word, and claimed values that a sample may hold."""
@@ -84,59 +86,82 @@ class Sampled:
         return out
 
 
-def sampled(
-    scenario: Scenario,
-    rows: LinkRows,
-    estimator: str = "local-fusion-graph",
-    *,
-    errors: bool = False,
-    runs: int = 1000,
-    seed: int = 1,
-    workers: int | None = None,
-    criterion: str = "det",
-    progress: Progress | None = None,
-) -> Sampled:
-    """Draw a sample of an estimator's claimed covariances.
-
-    Parameters
-    ----------
-    errors : whether the moments of the actual error are wanted too.
-    runs : independent runs for every row, at least 2.
-    seed : of the random numbers; the same seed gives the same sample, whatever the number of workers.
-    workers : processes; default: one for small samples, else one per processor.
-    criterion : what the weights of an intersection minimise, see `stochfuse.estimators.making.make`.
-    progress : told how many parts of the work are done.
+def averaged(system: System, items: Items, how: Settings, errors: bool) -> Averaged:
+    """Draw a sample of an estimator's estimates, as a method; see `Averaged`.
 
     Raises
     ------
     UsageError
         If runs, seed or workers are out of range.
     """
-    for name, given, least in (("runs", runs, 2), ("seed", seed, 0), ("workers", 1 if workers is None else workers, 1)):
-        if given < least:
-            raise UsageError(f"{name}: expected a whole number of at least {least}, got {given}")
-    network, kinds = scenario.network, scenario.kind_of
+    parts = []
+    for members, alone, some in items.by_noises(system):
+        found = sampled(alone, some.links, how, errors=errors)
+        parts.append(
+            (
+                members,
+                Averaged(
+                    moments=found.moments(),
+                    group_of=group_of(found.groups),
+                    natures=np.full(len(some), "sampled"),
+                    estimator=how.estimator,
+                    rounding=np.zeros(len(some)),
+                    sampled=found,
+                    meta={"runs": how.runs, "seed": how.seed},
+                ),
+            )
+        )
+    return joined(parts)
+
+
+def sampled(system: System, links: LinkRows, how: Settings, *, errors: bool = False) -> Sampled:
+    """Draw a sample of an estimator's estimates.
+
+    Parameters
+    ----------
+    how : runs, seed, workers, estimator and progress.
+    errors : whether the moments of the actual error are wanted too.
+
+    Raises
+    ------
+    UsageError
+        If runs, seed or workers are out of range.
+    """
+    given = (("runs", how.runs, 2), ("seed", how.seed, 0), ("workers", 1 if how.workers is None else how.workers, 1))
+    for name, value_of, least in given:
+        if value_of < least:
+            raise UsageError(f"{name}: expected a whole number of at least {least}, got {value_of}")
+    network, kinds, rows = system.network, system.labels, len(links.link)
     if network.agents > MOST_AGENTS:
         raise UsageError(f"method 'monte-carlo' takes at most {MOST_AGENTS} agents, got {network.agents}")
-    numbers = runs * len(rows.link) * network.steps * network.agents
+    numbers = how.runs * rows * network.steps * network.agents
     if numbers > MOST_NUMBERS:
         raise UsageError(
-            f"runs: {runs} runs for {len(rows.link)} link probabilities, {network.steps} steps and "
-            f"{network.agents} agents are "
-            f"{numbers:.3g} values; expected at most {MOST_NUMBERS:.3g}"
+            f"runs: {how.runs} runs for {rows} link probabilities, {network.steps} steps and {network.agents} agents "
+            f"are {numbers:.3g} values; expected at most {MOST_NUMBERS:.3g}"
         )
-    permutations = relabellings(network, rows, kinds)
+    permutations = relabellings(network, links, kinds)
     experiment = Experiment(
         agents=network.agents,
-        events=[events(network, rows, step) for step in range(1, network.steps + 1)],
+        events=[events(network, links, step) for step in range(1, network.steps + 1)],
         delay=network.delay,
-        make=partial(make, scenario, estimator, permutations, errors=errors, criterion=criterion),
+        make=partial(_made, system, how, permutations, errors),
         of=moments if errors else claimed_only,
-        runs=runs,
-        seed=seed,
+        runs=how.runs,
+        seed=how.seed,
     )
+    workers = how.workers
     if workers is None:
-        workers = len(os.sched_getaffinity(0)) if runs * len(rows.link) >= MANY else 1
+        workers = len(os.sched_getaffinity(0)) if how.runs * rows >= MANY else 1
+    progress = how.progress
     told = None if progress is None else lambda done, total: progress.advance(0, done, total)
-    drawn = sample(experiment, len(rows.link), workers=workers, progress=told)
-    return Sampled(drawn, groups_alike(network, rows, kinds, permutations))
+    drawn = sample(experiment, rows, workers=workers, progress=told)
+    return Sampled(drawn, groups_alike(network, links, kinds, permutations))
+
+
+def _made(
+    system: System, how: Settings, permutations: list[tuple[int, ...]], errors: bool
+) -> tuple[Estimator, Callable[[], Claims]]:
+    """An estimator, and what to call for its numbers."""
+    made = make(system, how.estimator, permutations, errors=errors, criterion=how.criterion)
+    return made.estimator, partial(made.claims, system, Noises())

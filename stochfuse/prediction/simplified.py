@@ -28,22 +28,30 @@ Departures from the source
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.engines.mean_field import COMMON, Case, Outcomes, run, run_like
-from stochfuse.errors import StochfuseError, UsageError
+from stochfuse.engines.mean_field import Case, Outcomes, run, run_like
+from stochfuse.engines.precision import definite, ill_noise, lost, rounding, told
+from stochfuse.errors import UsageError
+from stochfuse.estimators.making import require_independent_noise, require_one_state
 from stochfuse.kalman.algebra import NUMPY, Algebra, inverse
 from stochfuse.kalman.arrivals import Counts, like_senders, poisson_binomial
-from stochfuse.kalman.averaged_update import sound
+from stochfuse.kalman.averaged_update import noise_factor, sound
 from stochfuse.kalman.checks import first_fault
 from stochfuse.kalman.kernel import Estimate, from_information, to_information, update, update_information
-from stochfuse.scenario.model import Noises
+from stochfuse.kalman.metrics import Moments
+from stochfuse.prediction.method import Averaged, joined
 from stochfuse.scenario.network import LinkRows, Network, number_of_senders, possible_senders, require_memoryless
-from stochfuse.scenario.scenario import Scenario, require_independent_noise, require_one_state
+from stochfuse.scenario.system import Items, Noises, System
 
+NAME = "broadcast-prior"
+"""What the agents are taken to do: they share the broadcast prior and nothing else."""
+DOUBTFUL = 1e-10
+"""Smallest pivot of R, relative to its variance, below which it takes a library's word that there is a factor."""
 MOST_OUTCOMES = 100_000
 """Sets of senders (counted by kind of sensor) beyond which unlike agents are refused."""
 
@@ -104,48 +112,107 @@ class Covariances(NamedTuple):
 
     Parameters
     ----------
-    P : (links, steps, groups, d, d).
+    P : (items, steps, groups, d, d); an item with a fault may have entries that are not finite.
     group_of : index into the groups for every agent, shape (agents,).
     forms : which numeric forms were used.
+    faults : per item whose result is no covariance, the first step and why.
+    cancelled : (items,) whether the measurement-space form cancelled, so that the square-root form was needed.
     """
 
     P: np.ndarray
     group_of: np.ndarray
     forms: tuple[str, ...]
+    faults: dict[int, str]
+    cancelled: np.ndarray
 
 
-def covariances(scenario: Scenario, rows: LinkRows) -> Covariances:
-    """Evaluate (54) for every row of link probabilities and every step.
+def averaged(system: System, items: Items) -> Averaged:
+    """Evaluate (54) as a method, see `Averaged`; errors are added by `stochfuse.prediction.states.with_errors`.
+
+    Raises
+    ------
+    UsageError
+        As `covariances`.
+    """
+    if not items.noises.common and not _one_case(system, items.links):
+        return joined([(members, averaged(alone, some)) for members, alone, some in items.by_noises(system)])
+    found = covariances(system, items)
+    said, faults = departures(system, items.links), dict(found.faults)
+    reach = np.zeros(len(items))
+    if items.noises.common and not faults and ("square-root" in found.forms or ill_noise(system)):
+        reach = reach_of_rounding(system, items)
+        said += [told(float(reach[lost(reach)].max()))] if lost(reach).any() else []
+    elif not items.noises.common and found.cancelled.any():
+        some = np.flatnonzero(found.cancelled)
+        reach[some] = reach_of_rounding(system, items.take(some))
+        faults = {int(item): told(float(reach[item])) for item in some if lost(reach[item])} | faults
+    return Averaged(
+        moments=Moments(found.P),
+        group_of=found.group_of,
+        natures=np.full(len(items), "approximate"),
+        estimator=NAME,
+        rounding=reach,
+        faults=faults,
+        notes=tuple(said),
+        forms=found.forms,
+    )
+
+
+def covariances(system: System, items: Items) -> Covariances:
+    """Evaluate (54) for every item and every step.
+
+    Items with noises of their own are like agents with equal links: of others, give those of one set of noises.
 
     Raises
     ------
     UsageError
         If messages are delayed, unlike agents make too many outcomes, or agents do not track one state with independent
         noises.
-    StochfuseError
-        If a covariance grows beyond floating point.
     """
-    require_one_state(scenario, "method simplified")
-    require_independent_noise(scenario, "method simplified")
-    steps, links = scenario.network.steps, len(rows.link)
-    parts, forms, all_groups = [], set(), groups(scenario, rows)
+    require_one_state(system, "method simplified")
+    require_independent_noise(system, "method simplified")
+    steps, links = system.steps, len(items)
+    parts, forms, all_groups = [], set(), groups(system, items)
+    why: dict[int, str] = {}
+    needed_root = np.zeros(links, dtype=bool)
     for group in all_groups:
         if isinstance(group.case, Case):
-            P, cancelled = run_like(group.case, steps)
+            usable, singular = _factorable(group.case)
+            P, cancelled = run_like(usable, steps)
             forms |= forms_used(cancelled)
+            needed_root |= cancelled.reshape(links, -1).any(axis=1)
         else:
-            P = np.empty((steps, *scenario.P0.shape, group.case.items))
+            singular, P = {}, np.empty((steps, *system.P0.shape, group.case.items))
             with np.errstate(all="ignore"):
                 run(group.case, steps, P)
             forms.add("outcomes")
-        if not np.isfinite(P).all():
-            item, why = min(faults(P).items())
-            µ = rows.means(scenario.network)[item // group.columns]
-            raise StochfuseError(f"method simplified: {why} (link probability {µ:g})")
+        for item, fault in sorted((faults(P) | singular).items()):
+            why.setdefault(item // group.columns, fault)
         d = P.shape[1]
         parts.append(P.reshape(steps, d, d, links, group.columns).transpose(3, 0, 4, 1, 2))
     P = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=2)
-    return Covariances(P, index_of_groups(all_groups, scenario.network.agents), tuple(sorted(forms)))
+    return Covariances(P, index_of_groups(all_groups, system.agents), tuple(sorted(forms)), why, needed_root)
+
+
+def _factorable(case: Case) -> tuple[Case, dict[int, str]]:
+    """Return a case of which every item's R has a Cholesky factor, and why those that had none have no answer."""
+    R = case.noises.R
+    if R is None:
+        return case, {}
+    left = noise_factor(R)[1]
+    usable = left > 0
+    doubtful = np.flatnonzero(usable & (left < DOUBTFUL))
+    usable[doubtful] = definite(R[doubtful])
+    if usable.all():
+        return case, {}
+    why = "R: expected a positive definite matrix, got one that is singular to rounding"
+    fine = np.where(usable[:, None, None], R, np.eye(R.shape[-1]))
+    return replace(case, noises=case.noises._replace(R=fine)), dict.fromkeys(np.flatnonzero(~usable).tolist(), why)
+
+
+def _one_case(system: System, links: LinkRows) -> bool:
+    """Whether all agents are like ones with equal links, which take noises of the items' own."""
+    return len(system.sensors) == 1 and links.uniform
 
 
 def forms_used(cancelled: np.ndarray) -> set[str]:
@@ -177,25 +244,23 @@ def index_of_groups(all_groups: Sequence[Group], agents: int) -> np.ndarray:
     return index
 
 
-def reach_of_rounding(scenario: Scenario, rows: LinkRows) -> np.ndarray:
-    """Relative error that rounding may cause in the covariance of like agents at some step, for every row of links.
+def reach_of_rounding(system: System, items: Items) -> np.ndarray:
+    """Relative error that rounding may cause in the covariance of like agents at some step, for every item.
 
     At three or four times the cost of the square-root form; see `stochfuse.engines.precision`.  Zeros for unlike
     agents, for whom it is not known.
     """
-    from stochfuse.engines.precision import rounding
-
-    reach = np.zeros(len(rows.link))
-    for group in groups(scenario, rows):
+    reach = np.zeros(len(items))
+    for group in groups(system, items):
         if isinstance(group.case, Case):
-            of_items = rounding(group.case, run_like(group.case, scenario.network.steps)[0])
-            reach = np.maximum(reach, of_items.reshape(len(rows.link), -1).max(axis=1))
+            of_items = rounding(group.case, run_like(group.case, system.steps)[0])
+            reach = np.maximum(reach, of_items.reshape(len(items), -1).max(axis=1))
     return reach
 
 
-def departures(scenario: Scenario, rows: LinkRows) -> list[str]:
+def departures(system: System, rows: LinkRows) -> list[str]:
     """Return what of a scenario lies outside the derivation of (54), one sentence each."""
-    network = scenario.network
+    network = system.network
     notes = []
     if network.architecture == "cyclic" and network.agents > 2:
         notes.append(
@@ -218,9 +283,9 @@ def require_prompt(network: Network) -> None:
         raise UsageError("method 'simplified' is derived without delay (thesis 4.2); network.delay must be 0")
 
 
-def groups(scenario: Scenario, rows: LinkRows) -> list[Group]:
+def groups(system: System, items: Items) -> list[Group]:
     """Return the groups of agents that (54) has to be evaluated for."""
-    network = scenario.network
+    network, rows = system.network, items.links
     require_prompt(network)
     steps = range(1, network.steps + 1)
     require_memoryless(
@@ -228,29 +293,29 @@ def groups(scenario: Scenario, rows: LinkRows) -> list[Group]:
         "method 'simplified'",
         "it averages after every step and forgets which links were bad; use general, optimal or monte-carlo",
     )
-    shared = scenario.correlation == "shared"
-    if len(scenario.sensors) == 1 and rows.uniform:
-        return [Group((tuple(range(network.agents)),), like_case(scenario, rows))]
+    shared = system.shared
+    if _one_case(system, rows):
+        return [Group((tuple(range(network.agents)),), like_case(system, rows, items.noises))]
     matrices = dict(zip(steps, _per_step(rows, network.steps, lambda k: rows.matrices(network, k)), strict=True))
-    kinds = np.asarray(scenario.sensor_of)
+    kinds = np.asarray(system.sensor_of)
     senders_of = possible_senders(network.architecture, network.agents)
     return [
-        _group(scenario, shared, np.flatnonzero(kinds == own), own, kinds[senders_of], matrices)
-        for own in range(len(scenario.sensors))
+        _group(system, shared, np.flatnonzero(kinds == own), own, kinds[senders_of], matrices)
+        for own in range(len(system.sensors))
     ]
 
 
-def like_case(scenario: Scenario, rows: LinkRows, noises: Noises = COMMON) -> Case:
-    """Like agents with equally likely links, and the noises of each row's own where there are any."""
-    network = scenario.network
+def like_case(system: System, rows: LinkRows, noises: Noises) -> Case:
+    """Like agents with equally likely links, and the noises of the items' own where there are any."""
+    network = system.network
     senders = number_of_senders(network.architecture, network.agents)
     arrivals = _per_step(rows, network.steps, lambda k: like_senders(senders, rows.at_step(k)))
-    shared = scenario.correlation == "shared"
-    return Case(scenario.model, scenario.sensors[0], scenario.P0, shared, arrivals, len(rows.link), noises)
+    shared = system.shared
+    return Case(system.model, system.sensors[0], system.P0, shared, arrivals, len(rows.link), noises)
 
 
 def _group(
-    scenario: Scenario,
+    system: System,
     shared: bool,
     agents: np.ndarray,
     own: int,
@@ -275,12 +340,12 @@ def _group(
     )
     _, first, column_of = np.unique(signature, axis=0, return_index=True, return_inverse=True)
     members = tuple(tuple(agents[column_of.ravel() == c].tolist()) for c in range(len(first)))
-    if len(scenario.sensors) == 1:
+    if len(system.sensors) == 1:
         tables = {id(h): Counts(_items(poisson_binomial(np.moveaxis(h[:, first], -1, 0)))) for h in by_step}
         arrivals = [tables[id(h)] for h in by_step]
         items = by_step[0].shape[0] * len(first)
-        return Group(members, Case(scenario.model, scenario.sensors[0], scenario.P0, shared, arrivals, items))
-    return Group(members, _outcomes(scenario, shared, own, kinds_here[first], [h[:, first] for h in by_step]))
+        return Group(members, Case(system.model, system.sensors[0], system.P0, shared, arrivals, items))
+    return Group(members, _outcomes(system, shared, own, kinds_here[first], [h[:, first] for h in by_step]))
 
 
 def _sort_within(heard: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -296,11 +361,9 @@ def _items(table: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(table.reshape(len(table), -1))
 
 
-def _outcomes(
-    scenario: Scenario, shared: bool, own: int, sender_kinds: np.ndarray, heard: list[np.ndarray]
-) -> Outcomes:
+def _outcomes(system: System, shared: bool, own: int, sender_kinds: np.ndarray, heard: list[np.ndarray]) -> Outcomes:
     """Every count of arrivals per kind of sensor; receivers of one kind may hear different numbers of each."""
-    kinds = range(len(scenario.sensors))
+    kinds = range(len(system.sensors))
     most = [int((sender_kinds == kind).sum(axis=1).max()) if sender_kinds.size else 0 for kind in kinds]
     number = int(np.prod([n + 1.0 for n in most]))
     if number > MOST_OUTCOMES:
@@ -315,7 +378,7 @@ def _outcomes(
             seen[id(h)] = _outcome_weights(h, sender_kinds, counts, kinds)
         weights.append(seen[id(h)])
     own_measurement = np.eye(len(kinds), dtype=int)[own]
-    return Outcomes(scenario.model, scenario.sensors, scenario.P0, shared, counts + own_measurement, weights)
+    return Outcomes(system.model, system.sensors, system.P0, shared, counts + own_measurement, weights)
 
 
 def _outcome_weights(heard: np.ndarray, sender_kinds: np.ndarray, counts: np.ndarray, kinds: range) -> np.ndarray:

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.engines.mean_field import Case
-from stochfuse.errors import UsageError
+from stochfuse.errors import StochfuseError, UsageError
 from stochfuse.kalman.arrivals import Arrivals
 from stochfuse.kalman.kernel import (
     Estimate,
@@ -32,11 +32,18 @@ from stochfuse.kalman.kernel import (
     update,
     update_factor,
 )
+from stochfuse.kalman.metrics import Moments
 from stochfuse.prediction import simplified
+from stochfuse.prediction.method import Averaged
 from stochfuse.scenario.model import Sensor
 from stochfuse.scenario.network import LinkRows, possible_senders
 from stochfuse.scenario.scenario import Scenario, link_rows
+from stochfuse.scenario.system import Items, System
 
+SELF_CONSISTENT = (
+    "the simplified formulation takes for granted that agents share the broadcast prior and nothing else: by its own "
+    "assumptions the actual covariance is the claimed one; for what is true see method general"
+)
 MOST_AGENTS = 12
 """Agents up to which records of their own are averaged over all sets of senders."""
 
@@ -82,7 +89,8 @@ def predict_states(
     """
     rows = link_rows(scenario, link)
     z = np.asarray(measurements, dtype=float)
-    steps, n = scenario.network.steps, scenario.network.agents
+    system = scenario.system
+    steps, n = system.steps, system.agents
     widths = {sensor.H.shape[-2] for sensor in scenario.sensors}
     expected = (
         f"(steps, p) or (steps, agents, p) with {steps} steps, {n} agents and p = {', '.join(map(str, sorted(widths)))}"
@@ -94,15 +102,25 @@ def predict_states(
     if not np.isfinite(z[1:steps]).all():
         raise UsageError("measurements: expected finite numbers, got NaN or infinity")
     if z.ndim == 2 and len(scenario.sensors) == 1:
-        x = _one_record(scenario, rows, z, printed)
+        x = _one_record(system, rows, z, printed)
     elif printed:
         raise UsageError("(53) as printed takes one record for all agents, of shape (steps, p)")
     else:
-        x = _own_records(scenario, rows, np.broadcast_to(z[:, None], (len(z), n, z.shape[-1])) if z.ndim == 2 else z)
+        x = _own_records(system, rows, np.broadcast_to(z[:, None], (len(z), n, z.shape[-1])) if z.ndim == 2 else z)
     return States(rows.means(scenario.network), np.arange(1, steps + 1), x[..., 0], scenario.model.states)
 
 
-def mean_error(scenario: Scenario, rows: LinkRows) -> np.ndarray:
+def with_errors(system: System, items: Items, found: Averaged) -> Averaged:
+    """Add what the simplified formulation says of the error itself: by its own assumptions no more than it claims."""
+    # one agent of each group stands for all of it
+    first = np.unique(found.group_of, return_index=True)[1]
+    bias = np.concatenate([mean_error(alone, some.links)[:, :, first] for _, alone, some in items.by_noises(system)])
+    order = np.argsort(np.concatenate([members for members, _, _ in items.by_noises(system)]))
+    moments = Moments.of(found.moments.P, found.moments.P, bias[order])
+    return found._replace(moments=moments, notes=(*found.notes, SELF_CONSISTENT))
+
+
+def mean_error(system: System, rows: LinkRows) -> np.ndarray:
     """What (53) leaves of the scenario's known initial error, shape (links, steps, agents, d, 1).
 
     An error obeys the equations of an estimate in a world whose state is zero: b(k) = (I − K̄H) F b(k−1) for like
@@ -113,30 +131,30 @@ def mean_error(scenario: Scenario, rows: LinkRows) -> np.ndarray:
     UsageError
         If unlike agents are too many to average over all sets of senders.
     """
-    steps, n, d = scenario.network.steps, scenario.network.agents, scenario.model.dimension
-    if scenario.error is None:
+    steps, n, d = system.network.steps, system.network.agents, system.model.dimension
+    if system.error is None:
         return np.zeros((len(rows.link), steps, n, d, 1))
-    still = replace(scenario, x0=scenario.error, model=replace(scenario.model, Bu=np.zeros((d, 1))))
-    widths = [sensor.H.shape[-2] for sensor in scenario.sensors]
+    still = replace(system, x0=system.error, model=replace(system.model, Bu=np.zeros((steps, d, 1))))
+    widths = [sensor.H.shape[-2] for sensor in system.sensors]
     if len(widths) == 1:
         return _one_record(still, rows, np.zeros((steps, widths[0])), printed=False)
-    return _own_records(still, rows, [[np.zeros(widths[kind]) for kind in scenario.sensor_of]] * steps)
+    return _own_records(still, rows, [[np.zeros(widths[kind]) for kind in system.sensor_of]] * steps)
 
 
-def _one_record(scenario: Scenario, rows: LinkRows, z: np.ndarray, printed: bool) -> np.ndarray:
-    (group,) = simplified.groups(scenario, rows)
+def _one_record(system: System, rows: LinkRows, z: np.ndarray, printed: bool) -> np.ndarray:
+    (group,) = simplified.groups(system, Items(rows))
     case = group.case
     if not isinstance(case, Case):
         raise TypeError("like agents make one Case")
-    P, group_of, _ = simplified.covariances(scenario, rows)
-    steps, d = scenario.network.steps, scenario.model.dimension
+    P, group_of = _covariances(system, rows)
+    steps, d = system.network.steps, system.model.dimension
     items = P.transpose(1, 0, 2, 3, 4).reshape(steps, -1, d, d)
-    x = np.broadcast_to(scenario.x0, (items.shape[1], d, 1))
+    x = np.broadcast_to(system.x0, (items.shape[1], d, 1))
     if printed and not case.shared:
         x = x * (case.first_share() * case.arrivals[0].gained(np.zeros(case.items)))[:, None, None]
     out = [x]
     for step in range(2, steps + 1):
-        prior, sensor = _prior(scenario, x, items[step - 2], step), _sensor(case.sensor, step)
+        prior, sensor = _prior(system, x, items[step - 2], step), case.sensor.at(step)
         arrivals, now = case.arrivals[step - 1], z[step - 1][:, None]
         if printed:
             x = _printed(prior, sensor, arrivals, now, items[step - 1])
@@ -168,24 +186,24 @@ def _printed(prior: Estimate, sensor: Sensor, arrivals: Arrivals, z: np.ndarray,
     return P @ (before.y + measured * (local.y - before.y))
 
 
-def _own_records(scenario: Scenario, rows: LinkRows, z: Sequence[Sequence[np.ndarray]] | np.ndarray) -> np.ndarray:
-    network, d = scenario.network, scenario.model.dimension
+def _own_records(system: System, rows: LinkRows, z: Sequence[Sequence[np.ndarray]] | np.ndarray) -> np.ndarray:
+    network, d = system.network, system.model.dimension
     if network.agents > MOST_AGENTS:
         raise UsageError(
             f"records of each agent's own are averaged over all sets of senders, for at most {MOST_AGENTS} agents; "
             f"got {network.agents}. Give one record of shape (steps, p)"
         )
-    P, group_of, _ = simplified.covariances(scenario, rows)
+    P, group_of = _covariances(system, rows)
     senders = possible_senders(network.architecture, network.agents)
-    x = [np.broadcast_to(scenario.x0, (len(rows.link), d, 1))] * network.agents
+    x = [np.broadcast_to(system.x0, (len(rows.link), d, 1))] * network.agents
     out = [np.stack(x, axis=1)]
     for step in range(2, network.steps + 1):
         heard = rows.matrices(network, step)
-        kinds = [_sensor(sensor, step) for sensor in scenario.sensors]
-        sensors = [(kinds[kind].H, kinds[kind].R) for kind in scenario.sensor_of]
+        kinds = [sensor.at(step) for sensor in system.sensors]
+        sensors = [(kinds[kind].H, kinds[kind].R) for kind in system.sensor_of]
         x = [
             _over_subsets(
-                _prior(scenario, x[i], P[:, step - 2, group_of[i]], step),
+                _prior(system, x[i], P[:, step - 2, group_of[i]], step),
                 i,
                 senders[i],
                 heard[:, i],
@@ -220,10 +238,14 @@ def _over_subsets(
     return total
 
 
-def _prior(scenario: Scenario, x: np.ndarray, P: np.ndarray, step: int) -> Estimate:
-    model = scenario.model
+def _prior(system: System, x: np.ndarray, P: np.ndarray, step: int) -> Estimate:
+    model = system.model
     return predict(Estimate(x, P), at_step(model.F, step), at_step(model.Q, step), at_step(model.Bu, step))
 
 
-def _sensor(sensor: Sensor, step: int) -> Sensor:
-    return Sensor(at_step(sensor.H, step), at_step(sensor.R, step))
+def _covariances(system: System, rows: LinkRows) -> tuple[np.ndarray, np.ndarray]:
+    """Averaged covariances (rows, steps, groups, d, d), and the group of every agent."""
+    found = simplified.covariances(system, Items(rows))
+    if found.faults:
+        raise StochfuseError(f"method simplified: {min(found.faults.items())[1]}")
+    return found.P, found.group_of

@@ -26,6 +26,7 @@ from stochfuse.prediction import simplified
 from stochfuse.scenario.model import Model, Sensor
 from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.scenario import Scenario, link_rows
+from stochfuse.scenario.system import Items
 
 TOLERANCE = 1e-12
 WARM_UP = 40
@@ -78,10 +79,10 @@ def steady_state(scenario: Scenario, link: Sequence[float] | LinkRows | None = N
     if scenario.model.varies or any(s.varies for s in sensors) or rows.varies:
         raise UsageError("a steady state needs a model, sensors and links that do not vary with the step")
     brief = replace(scenario, network=replace(scenario.network, steps=2))
-    parts, groups = [], simplified.groups(brief, rows)
+    parts, groups = [], simplified.groups(brief.system, Items(rows))
     for group in groups:
         if isinstance(group.case, Case):
-            _require_detectable(scenario.model, group.case.sensor, scenario.P0)
+            _require_detectable(scenario.model, group.case.sensor.at(2), scenario.P0)
         P = _solve(group.case)
         residual, bound = _certify(group.case, P)
         shape = (len(rows.link), group.columns)

@@ -24,7 +24,8 @@ import numpy as np
 
 from stochfuse.engines.events import events
 from stochfuse.errors import UsageError
-from stochfuse.prediction.predict import RUNS, SEED, choose, predict
+from stochfuse.prediction.method import RUNS, SEED
+from stochfuse.prediction.predict import choose, predict
 from stochfuse.questions.message_chain import frequencies, like_agents, naive_load, sampled_loads, walked_load
 from stochfuse.scenario.network import LinkRows, require_memoryless
 from stochfuse.scenario.scenario import Scenario, link_rows, require_one_state

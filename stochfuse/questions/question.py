@@ -14,10 +14,11 @@ import numpy as np
 
 from stochfuse.errors import UsageError
 from stochfuse.kalman.metrics import Metric, metric
-from stochfuse.prediction.predict import METHODS, choose
+from stochfuse.prediction.predict import choose
 from stochfuse.prediction.predict import predict as predict_
 from stochfuse.prediction.quantities import noun
 from stochfuse.prediction.result import Prediction
+from stochfuse.scenario.registry import METHODS
 from stochfuse.scenario.scenario import Scenario
 
 SLACK = 8 * np.finfo(float).eps

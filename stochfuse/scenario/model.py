@@ -11,9 +11,25 @@ prediction or measurement (see `stochfuse.scenario.scenario`).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
+
+from stochfuse.kalman.kernel import at_step
+
+
+def varies(M: np.ndarray) -> bool:
+    """Whether a matrix depends on the step: a stack, and not one matrix seen at every step (`over_steps`)."""
+    return M.ndim > 2 and M.strides[0] != 0
+
+
+def over_steps(M: np.ndarray, steps: int) -> np.ndarray:
+    """Return a matrix, constant or per step, as a stack over the steps; a constant one takes no memory more."""
+    return np.broadcast_to(M, (steps, *M.shape)) if M.ndim == 2 else M[:steps]
+
+
+def once(M: np.ndarray) -> np.ndarray:
+    """Return a matrix that is the same at every step as one matrix, what depends on the step as it is."""
+    return M if M.ndim == 2 or varies(M) else M[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,10 +39,14 @@ class Sensor:
     H: np.ndarray
     R: np.ndarray
 
+    def at(self, step: int) -> Sensor:
+        """Return what it measures at a step."""
+        return Sensor(at_step(self.H, step), at_step(self.R, step))
+
     @property
     def varies(self) -> bool:
         """Whether H or R depends on the step."""
-        return max(self.H.ndim, self.R.ndim) > 2
+        return varies(self.H) or varies(self.R)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,25 +86,6 @@ class Noise:
     disturbance: np.ndarray | None = None
 
 
-class Noises(NamedTuple):
-    """Noises of a batch of scenarios that have everything else in common; None where the scenario's own are meant.
-
-    Parameters
-    ----------
-    Q : (items, d, d) process noise as it enters the state.
-    R : (items, p, p) measurement noise of every agent's sensor, positive definite.
-    P0 : (items, d, d) covariance of the first estimates.
-    """
-
-    Q: np.ndarray | None = None
-    R: np.ndarray | None = None
-    P0: np.ndarray | None = None
-
-    def take(self, items: np.ndarray | slice) -> Noises:
-        """Return the noises of some of the items."""
-        return Noises(*(None if M is None else M[items] for M in self))
-
-
 @dataclass(frozen=True, eq=False)
 class Model:
     """How the state moves, and what its components are called.
@@ -111,4 +112,4 @@ class Model:
     @property
     def varies(self) -> bool:
         """Whether any matrix depends on the step."""
-        return max(self.F.ndim, self.Q.ndim, self.Bu.ndim) > 2
+        return any(map(varies, (self.F, self.Q, self.Bu)))

@@ -66,6 +66,13 @@ class LinkRows:
     link: np.ndarray
     bursts: tuple[np.ndarray | None, ...] | None = None
 
+    def take(self, rows: np.ndarray | slice) -> LinkRows:
+        """Return some of the rows."""
+        chosen = np.arange(len(self.link))[rows]
+        names = None if self.names is None else tuple(self.names[i] for i in chosen)
+        bursts = None if self.bursts is None else tuple(self.bursts[i] for i in chosen)
+        return LinkRows(names, self.link[chosen], bursts)
+
     @property
     def uniform(self) -> bool:
         """Whether in every row all links of a step are equally likely."""
@@ -84,6 +91,18 @@ class LinkRows:
         if self.bursts is None:
             return None
         return np.array([(0.5, 0.5, m, m) if b is None else b for m, b in zip(µ, self.bursts, strict=True)])
+
+    def common(self, network: Network) -> np.ndarray | None:
+        """Probability that all possible links have in common at all steps, (rows,); None if they differ or remember."""
+        if self.varies or self.bursts is not None:
+            return None
+        if self.uniform:
+            return self.link
+        there = reachable(network)
+        inside, outside = self.link[:, there], self.link[:, ~there & ~np.eye(network.agents, dtype=bool)]
+        if not there.any() or (outside > 0).any() or (inside != inside[:, :1]).any():
+            return None
+        return inside[:, 0]
 
     def at_step(self, step: int) -> np.ndarray:
         """Probabilities at a step, shape (rows,) if uniform, else (rows, receiver, sender)."""
@@ -133,6 +152,13 @@ def possible_senders(architecture: str, agents: int) -> np.ndarray:
     if architecture == "cyclic":
         return ((everyone + 1) % agents)[:, None][:, : min(1, agents - 1)]
     return np.broadcast_to(everyone, (agents, agents))[~np.eye(agents, dtype=bool)].reshape(agents, agents - 1)
+
+
+def reachable(network: Network) -> np.ndarray:
+    """Whether agent i may hear agent j, (n, n): by the architecture, and by network.hears."""
+    n, there = network.agents, np.zeros((network.agents, network.agents), dtype=bool)
+    np.put_along_axis(there, possible_senders(network.architecture, n), True, axis=1)
+    return there if network.hears is None else there & network.hears
 
 
 def number_of_senders(architecture: str, agents: int) -> int:

@@ -17,6 +17,7 @@ import copy
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from stochfuse.scenario.checker import Checker
 from stochfuse.scenario.model import Filter, Model, Noise, Sensor
 from stochfuse.scenario.network import LinkRows, Network, default_rows, restricted, stacked_rows, uniform_rows
 from stochfuse.scenario.registry import ESTIMATORS, METHODS
+from stochfuse.scenario.system import System
 from stochfuse.scenario.tables import read_filters, read_link, read_model, read_network, read_noise, read_sensors
 
 SCHEMA = "stochfuse.scenario/1"
@@ -85,14 +87,10 @@ class Scenario:
     estimator: str | None = None
     runs: int | None = None
 
-    @property
-    def kind_of(self) -> tuple[int, ...]:
-        """Kind of every agent: those of one kind may change places."""
-        alike = one_state(self)
-        if self.noise is not None:
-            c = self.noise.correlation
-            alike &= len(set(c[~np.eye(len(c), dtype=bool)])) <= 1 and self.noise.disturbance is None
-        return self.sensor_of if alike else tuple(range(self.network.agents))
+    @cached_property
+    def system(self) -> System:
+        """The scenario as engines see it; see `stochfuse.scenario.system`."""
+        return System.of(self)
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any], name: str = "scenario") -> Scenario:

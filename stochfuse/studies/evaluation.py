@@ -1,8 +1,9 @@
 """The answers of some points of a study, in batches.
 
-Points that differ in link probability and in noises given as numbers (model.Q, model.R, initial.P) only are one batch
-(`stochfuse.batches`).  Where a method makes no batch, or a batch has no answer, noises are gone through one by one, all
-link probabilities of one together; and where that has no answer, point by point, so that an error is its point's alone.
+Points that differ in link probability and in noises given as numbers (model.Q, model.R, initial.P) only are items of
+one system (`stochfuse.prediction.predict.predict_items`).  Where they have no answer together, noises are gone through
+one by one, all link probabilities of one together; and where that has no answer, point by point, so that an error is
+its point's alone.
 """
 
 from __future__ import annotations
@@ -12,16 +13,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse import batches
 from stochfuse.engines.enumeration import TooManyError
 from stochfuse.engines.precision import told
 from stochfuse.errors import NoAnswerError, ScenarioError, StochfuseError
 from stochfuse.kalman.checks import LARGEST, covariance_fault, first_fault
-from stochfuse.prediction.predict import predict_several
+from stochfuse.prediction.predict import WORTHLESS, predict_items, predict_several
 from stochfuse.prediction.result import Prediction
 from stochfuse.questions.messages import message_load
-from stochfuse.scenario.model import Noises
+from stochfuse.scenario.network import restricted, uniform_rows
 from stochfuse.scenario.scenario import Scenario
+from stochfuse.scenario.system import Items, Noises
 from stochfuse.studies.plan import ERROR, MESSAGES, NODES, SETTINGS, Plan, default_method, put
 
 LINK, Q, R, P0 = "network.link", "model.Q", "model.R", "initial.P"
@@ -219,6 +220,8 @@ def _batch(asked: _Asked, items: np.ndarray) -> np.ndarray:
     def times(path: str, M: np.ndarray) -> np.ndarray | None:
         return numbers[path][items][:, None, None] * M if path in numbers else None
 
+    if _alone(asked):
+        return items
     common = _common_link(unit)
     constant = all(M.ndim == 2 for M in (unit.model.Q, *(s.R for s in unit.sensors)))
     if not constant or len(unit.sensors) != 1 or (LINK not in numbers and common is None):
@@ -226,7 +229,8 @@ def _batch(asked: _Asked, items: np.ndarray) -> np.ndarray:
     link = numbers[LINK][items] if LINK in numbers else np.full(len(items), common)
     noises = Noises(times(Q, unit.model.Q), times(R, unit.sensors[0].R), times(P0, unit.P0))
     try:
-        found = batches.predict(unit, link, noises, asked.method, asked.quantities, **asked.settings)
+        rows = restricted(uniform_rows(link), unit.network)
+        found = predict_items(unit, Items(rows, noises), asked.method, asked.quantities, **asked.settings)
         _fill(asked, found.predictions, items)
     except TooManyError as error:  # numbers have no say in that
         asked.fail(items, error)
@@ -243,7 +247,7 @@ def _batch(asked: _Asked, items: np.ndarray) -> np.ndarray:
         return np.concatenate([items[:0], *(_batch(asked, part) for part in parts if len(part))])
     for place, reason in found.faults.items():
         group.errors[int(items[place])] = reason
-    for nature in ("exact", "approximate"):
+    for nature in np.unique(found.natures).tolist():
         group.mark(items[found.natures == nature], (*_kind(asked, found.predictions)[:2], nature))
     return items[:0]
 
@@ -279,10 +283,14 @@ def _of_noises(asked: _Asked, values: Mapping[str, float], items: np.ndarray) ->
     except StochfuseError as error:
         asked.fail(items, error)
         return
-    alone = asked.method == "monte-carlo" or asked.settings.get("prune", False)
-    if alone or not _several(asked, scenario, items):
+    if _alone(asked) or not _several(asked, scenario, items):
         for item in items:
             _several(asked, scenario, np.array([item]))
+
+
+def _alone(asked: _Asked) -> bool:
+    """Whether the answer of a point depends on the company it is asked in."""
+    return asked.method == "monte-carlo" or bool(asked.settings.get("prune", False))
 
 
 def _several(asked: _Asked, scenario: Scenario, items: np.ndarray) -> bool:
@@ -336,7 +344,7 @@ def _kind(asked: _Asked, found: Sequence[Prediction]) -> Kind:
 
 def _check(p: Prediction, rows: np.ndarray, items: np.ndarray, group: _Group) -> None:
     """Note as its points' error what is no answer: an indefinite covariance, or one that is rounding."""
-    if p.outcomes is not None and p.outcomes.rounding > batches.WORTHLESS:
+    if p.outcomes is not None and p.outcomes.rounding > WORTHLESS:
         group.errors.update(dict.fromkeys(items.tolist(), told(p.outcomes.rounding)))
     P = p.moments.P[rows]
     if covariance_fault(P) is None:

@@ -33,10 +33,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.engines.enumeration import Ending, claimed
 from stochfuse.engines.events import bernstein, relabellings
 from stochfuse.engines.progress import Progress
 from stochfuse.prediction.general import Outcomes, outcomes
+from stochfuse.prediction.method import Settings
 from stochfuse.prediction.predict import predict
 from stochfuse.prediction.states import predict_states
 from stochfuse.questions.messages import MessageLoad, message_load
@@ -269,9 +269,12 @@ class Bench:
             scenario = self.scenario(case, architecture)
             # other networks take no time that is worth a word
             told = self.progress if architecture == "ad-hoc" else None
-            found = outcomes(scenario, link_rows(scenario, LINKS), rule, errors=errors, progress=told)
-            turns = [noise_order(p, self.steps) for p in relabellings(scenario.network, found.rows, scenario.sensor_of)]
-            return [_averages(found, ending).symmetric(turns) for ending in found.structure.endings]
+            how = Settings(estimator=rule, progress=told)
+            found = outcomes(scenario.system, link_rows(scenario, LINKS), how, errors=errors)
+            turns = [
+                noise_order(p, self.steps) for p in relabellings(scenario.network, found.links, scenario.sensor_of)
+            ]
+            return [_averages(found, step).symmetric(turns) for step in range(1, self.steps + 1)]
 
         key = ("averages", case, architecture, rule)
         return self.known.get((*key, True)) or self.once((*key, errors), make)
@@ -327,29 +330,17 @@ class Bench:
         return self.once(("messages", architecture, tuple(links), rule), make)
 
 
-def _averages(found: Outcomes, ending: Ending) -> Averages:
-    """Average a step over the outcomes, of which all agents are alike.
-
-    What `stochfuse.engines.enumeration.expectation` does, with the sum over the last exchange's outcomes inside a
-    product of matrices: the products of one outcome alone would fill the memory.
-    """
-    weights, least, most = found.weights, np.inf, 0.0
-    total: Any = 0.0
-    noises = 0
-    for view, states, estimate, _ in claimed(ending, found.values):
-        P = estimate.P[..., 0]
+def _averages(found: Outcomes, step: int) -> Averages:
+    """Average a step over the outcomes, of which all agents are alike."""
+    least, most, total = np.inf, 0.0, [0.0, 0.0, 0.0]
+    for weights, estimate, _ in found.found.shared_out(step, found.values):
+        P, weight = estimate.P[..., 0], weights[0]
         least, most = min(least, P.min()), max(most, P.max())
-        parts = [np.add.reduceat(P, view.starts, axis=1)]
-        if estimate.x is not None:
-            noises = estimate.x.shape[-1]
-            x = estimate.x[..., 0, :]
-            parts.append(np.add.reduceat(x, view.starts, axis=1))
-            products = [np.swapaxes(part, 1, 2) @ part for part in np.split(x, view.starts[1:], axis=1)]
-            parts.append(np.stack(products, axis=1).reshape(*parts[0].shape[:2], -1))
-        by_factor = weights.total(ending.weights[states], view.factors, np.concatenate(parts, axis=2))
-        total = total + weights.completed(weights.weighed(by_factor, view.shares[0]), ending.events)
-    P, first, products = np.split(total, [1, 1 + noises], axis=1)
-    return Averages(P[:, 0], first, products.reshape(len(total), noises, noises), (float(least), float(most)))
+        x = np.zeros((len(P), 0)) if estimate.x is None else estimate.x[:, 0]
+        parts = [weight @ P, weight @ x, np.stack([(w[:, None] * x).T @ x for w in weight])]
+        total = [before + part for before, part in zip(total, parts, strict=True)]
+    P, first, products = (np.asarray(part) for part in total)
+    return Averages(P[:, 0], first, products, (float(least), float(most)))
 
 
 def noise_order(agents: Sequence[int], steps: int) -> np.ndarray:
