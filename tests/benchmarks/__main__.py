@@ -15,10 +15,10 @@ from rich.console import Console
 from rich.table import Table
 
 import stochfuse as sf
-from tests import textbook
+from tests.agreement.test_accuracy import CASES
 from tests.benchmarks import chain, growth, intersection, literal, studies
-from tests.strategies import mapping
-from tests.test_accuracy import CASES
+from tests.oracles import textbook
+from tests.oracles.strategies import mapping
 
 HERE = Path(__file__).parent
 LINK = np.linspace(0, 1, 1001)

@@ -16,9 +16,9 @@ from stonesoup.mixturereducer.gaussianmixture import CovarianceIntersection
 from stonesoup.types.state import GaussianState
 
 from stochfuse.fusion.intersection import Criterion, Stack, fuse_stack
-from tests import textbook
 from tests.benchmarks.intersection import D, random_pairs, scipy_loop
 from tests.benchmarks.peers.ways import OURS, STONE_SOUP, Row, Section, Way, agreed, timed
+from tests.oracles import textbook
 
 TOLERANCE = 1e-10
 SETTLED = 50

@@ -25,7 +25,6 @@ import stochfuse as sf
 from stochfuse.batches import simplified
 from stochfuse.kalman import kernel as kalman
 from stochfuse.scenario.model import Noises
-from tests import textbook
 from tests.benchmarks.peers.ways import (
     FILTERPY,
     OURS,
@@ -37,7 +36,8 @@ from tests.benchmarks.peers.ways import (
     fastest,
     timed,
 )
-from tests.strategies import mapping
+from tests.oracles import textbook
+from tests.oracles.strategies import mapping
 
 STEPS = 5
 

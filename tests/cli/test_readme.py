@@ -1,0 +1,94 @@
+"""Everything that the README shows is run, and what it prints must be what the README prints.
+
+`python -m tests.cli.test_readme` writes the outputs into the README after a change that was looked at.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+README = Path(__file__).parents[2] / "README.md"
+CONSOLE = re.compile(r"```console\n(.*?)```", re.DOTALL)
+
+
+def commands(block):
+    """The commands of a block, each with the output printed under it."""
+    found = []
+    for line in block.splitlines():
+        if line.startswith("$ "):
+            found.append((line[2:], []))
+        else:
+            found[-1][1].append(line)
+    return [(command, "\n".join(output).strip("\n")) for command, output in found]
+
+
+def shown():
+    return [c for block in CONSOLE.findall(README.read_text(encoding="utf-8")) for c in commands(block)]
+
+
+def execute(command, folder):
+    env = {**os.environ, "COLUMNS": "80", "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    done = subprocess.run(command, shell=True, cwd=folder, capture_output=True, text=True, env=env)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip("\n")
+
+
+def files(folder):
+    """Write the files that the README shows, whose first line is their name in a comment."""
+    text = README.read_text(encoding="utf-8")
+    for content, name in re.findall(r"```toml\n(# (\S+\.toml)\n.*?)```", text, re.DOTALL):
+        (folder / name).write_text(content)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return files(tmp_path_factory.mktemp("readme"))
+
+
+@pytest.mark.parametrize(("command", "output"), shown(), ids=[c for c, _ in shown()])
+def test_console_examples(command, output, folder):
+    assert execute(command, folder) == output
+
+
+def test_python_example(tmp_path):
+    (code,) = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+    (tmp_path / "example.py").write_text(code)
+    assert "thesis-transient: 3 agents, ad-hoc; every agent alike" in execute(f"{sys.executable} example.py", tmp_path)
+
+
+def test_scenario_example_is_valid(tmp_path):
+    (text,) = re.findall(r"```toml\n(?!# trade)(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+    (tmp_path / "mine.toml").write_text(text)
+    assert "ok: 3 agents with 2 kinds of sensors" in execute("stochfuse scenario check mine.toml", tmp_path)
+    assert "RMS of position [m]" in execute("stochfuse predict mine.toml --metric rms:position", tmp_path)
+
+
+def test_the_two_set_up_commands_are_one_line_each():
+    lines = [line for line in README.read_text(encoding="utf-8").splitlines() if line.startswith("python3 -m venv")]
+    assert len(lines) == 2
+    assert lines[0].endswith("stochfuse predict")
+    assert lines[1].endswith("-m pytest")
+
+
+def rewrite():
+    def fill(match):
+        lines = []
+        for command, _ in commands(match.group(1)):
+            lines.append(f"$ {command}\n{execute(command, folder)}".strip("\n"))
+        return "```console\n" + "\n\n".join(lines) + "\n```"
+
+    with tempfile.TemporaryDirectory() as made:
+        folder = files(Path(made))
+        README.write_text(CONSOLE.sub(fill, README.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    rewrite()
