@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from stochfuse.prediction.compare import compare as compare
     from stochfuse.prediction.compare import compare_estimators as compare_estimators
     from stochfuse.prediction.predict import predict as predict
+    from stochfuse.prediction.predict import predict_many as predict_many
     from stochfuse.prediction.result import Prediction as Prediction
     from stochfuse.prediction.states import predict_states as predict_states
     from stochfuse.prediction.steady_state import steady_state as steady_state
@@ -73,6 +74,7 @@ _HOME = {
     "load_scenario": "scenario.scenario",
     "message_load": "questions.messages",
     "predict": "prediction.predict",
+    "predict_many": "prediction.predict",
     "predict_states": "prediction.states",
     "read_results": "questions.results",
     "sensitivity": "questions.sensitivity",
@@ -107,6 +109,7 @@ __all__ = [
     "load_scenario",
     "message_load",
     "predict",
+    "predict_many",
     "predict_states",
     "read_results",
     "sensitivity",

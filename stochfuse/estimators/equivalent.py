@@ -38,7 +38,7 @@ class EquivalentMeasurement(RecursiveEstimator):
         self._rules: dict[tuple[int, int], Rule] = {}
         varying = [each.ndim > 2 for each in (*world.R, *world.H)]
         self._varies = any(varying)
-        self._sees = [i for i in range(world.agents) if world.H[i].shape[-2]]
+        self._sees = [i for i in range(world.agents) if world.H[i].any()]
         for i in self._sees:
             first = world.H[self._sees[0]]
             if world.H[i].shape != first.shape or (world.H[i] != first).any():

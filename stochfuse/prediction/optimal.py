@@ -29,6 +29,7 @@ from stochfuse.engines.enclosure import enclosed_optimum
 from stochfuse.engines.events import relabellings
 from stochfuse.engines.precision import PROMISED, Moving, change, notes, reach, suspects
 from stochfuse.errors import UsageError
+from stochfuse.estimators.making import require_independent_noise, require_one_state
 from stochfuse.kalman.metrics import Moments
 from stochfuse.prediction.general import groups_alike
 from stochfuse.prediction.method import Averaged, Settings, group_of
@@ -140,6 +141,8 @@ def rounding(given: Filter, found: Chain, go: Callable[[Filter], Chain]) -> np.n
 
 def groups_of(system: System, links: LinkRows) -> tuple[tuple[int, ...], ...]:
     """Return the agents that are alike, whose optimum is the same."""
+    require_one_state(system, "the optimum")
+    require_independent_noise(system, "the optimum")
     network, kinds = system.network, system.sensor_of
     if _alike(system, links):
         return (tuple(range(network.agents)),)

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 import stochfuse as sf
 from stochfuse.kalman.metrics import metric
-from stochfuse.prediction.general import outcomes
 from stochfuse.scenario.scenario import link_rows
 from tests.agreement import test_matrix
 from tests.oracles import strategies, textbook
+from tests.oracles.many import outcomes
 
 LONG = ("ad hoc", "ad hoc, delays", "ad hoc, masked")
 NETWORKS = [name for name in test_matrix.NETWORKS if name not in LONG]

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import stochfuse as sf
-from stochfuse.prediction.general import outcomes
 from stochfuse.scenario.scenario import link_rows
 from tests.oracles import strategies, textbook
+from tests.oracles.many import outcomes
 
 
 class Case(NamedTuple):

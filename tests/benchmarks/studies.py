@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 
 import stochfuse as sf
-from stochfuse import batches
-from stochfuse.scenario.model import Noises
+from stochfuse.prediction.predict import predict_items
+from stochfuse.scenario.network import uniform_rows
+from stochfuse.scenario.system import Items, Noises
 from tests.benchmarks.growth import Growth, draw, seconds
 
 HEADINGS = ("work", "time", "memory", "rate", "promised")
@@ -76,7 +77,7 @@ def growth(quick: bool) -> dict[str, Growth]:
 
     def took(method: str, points: int, agents: int = 3, steps: int = 5, d: int = 1) -> float:
         scenario, link, noises = batch(points, agents, steps, d)
-        return seconds(lambda: batches.predict(scenario, link, noises, method), rounds)
+        return seconds(lambda: predict_items(scenario, Items(uniform_rows(link), noises), method, ["claimed"]), rounds)
 
     simplified: Growth = {
         "agents n": _curve(quick, [2, 5, 10, 20, 50, 100, 1000, 10_000], lambda n: took("simplified", few, agents=n)),

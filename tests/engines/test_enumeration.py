@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 import stochfuse as sf
 from stochfuse.engines.progress import Progress
 from stochfuse.kalman.metrics import metric
-from stochfuse.prediction.general import outcomes
 from stochfuse.scenario.scenario import link_rows
 from tests.benchmarks import literal
 from tests.oracles import strategies, textbook
+from tests.oracles.many import outcomes
 
 
 @st.composite
@@ -161,12 +161,16 @@ def test_unlike_agents_have_statistics_of_their_own():
 
 
 def test_rows_and_polynomials_agree():
-    """A matrix of equal probabilities is summed row by row, one probability as a polynomial."""
+    """Beside a row of unequal links a matrix of equal ones is summed row by row, alone as a polynomial."""
     scenario = sf.load_scenario(steps=3, agents=3)
     polynomial = sf.predict(scenario, [0.2, 0.7], method="general")
-    rows = sf.predict(scenario, np.stack([np.full((3, 3), µ) for µ in (0.2, 0.7)]), method="general")
-    np.testing.assert_allclose(rows.covariance, polynomial.covariance, rtol=1e-13)
-    np.testing.assert_allclose(rows.statistic("std"), polynomial.statistic("std"), rtol=1e-10)
+    equal = np.stack([np.full((3, 3), µ) for µ in (0.2, 0.7)])
+    unequal = np.random.default_rng(0).uniform(size=(1, 3, 3))
+    rows = sf.predict(scenario, np.concatenate([equal, unequal]), method="general")
+    np.testing.assert_allclose(rows.covariance[:2], polynomial.covariance, rtol=1e-13)
+    np.testing.assert_allclose(rows.statistic("std")[:2], polynomial.statistic("std"), rtol=1e-10)
+    alone = sf.predict(scenario, equal, method="general")
+    np.testing.assert_allclose(alone.outcomes.coefficients(2), polynomial.outcomes.coefficients(2), rtol=1e-14)
     with pytest.raises(sf.UsageError, match="a polynomial in µ: expected one link probability for all links"):
         rows.outcomes.coefficients(2)
 

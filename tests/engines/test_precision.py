@@ -13,8 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import stochfuse as sf
-from stochfuse.batches import predict as predict_batch
-from stochfuse.batches.simplified import covariances
 from stochfuse.engines.precision import PROMISED, lost
 from stochfuse.fusion.intersection import pair_weights
 from stochfuse.kalman.checks import covariance_fault
@@ -29,11 +27,13 @@ from stochfuse.kalman.kernel import (
     update_factor,
     update_information,
 )
+from stochfuse.prediction.predict import predict_items
 from stochfuse.prediction.simplified import reach_of_rounding
-from stochfuse.scenario.model import Noises
 from stochfuse.scenario.network import uniform_rows
+from stochfuse.scenario.system import Items, Noises
 from tests.agreement.test_accuracy import CASES, ODD_H, P0, F, H, Q
 from tests.oracles import textbook
+from tests.oracles.many import covariances
 from tests.oracles.strategies import covariance, mapping, seeds
 
 DIGITS = 50
@@ -103,7 +103,7 @@ def test_a_condition_of_1e12_is_borne_or_noticed(name):
     case = CONDITIONED[name]
     scenario, benign = sf.Scenario.from_mapping(mapping(*case, agents=3, steps=3)), np.eye
     one = sf.predict(scenario, LINKS).covariance
-    reach = reach_of_rounding(scenario, uniform_rows(LINKS))
+    reach = reach_of_rounding(scenario.system, Items(uniform_rows(LINKS)))
     d, p = case[2].shape[::-1]
     noises = Noises(*(np.array([M, M, M, benign(n)]) for M, n in ((case[1], d), (case[3], p), (case[4], d))))
     got = covariances(scenario, np.array([*LINKS, 0.5]), noises)
@@ -237,7 +237,8 @@ def answers(scenario, method, mu, case):
         prediction = sf.predict(scenario, [mu], method)
         yield prediction.covariance[0], any("ill-conditioned" in note for note in prediction.notes)
         with np.errstate(all="ignore"):
-            batch = predict_batch(scenario, np.array([mu]), Noises(*(case[i][None] for i in (1, 3, 4))), method)
+            own = Noises(*(case[i][None] for i in (1, 3, 4)))
+            batch = predict_items(scenario, Items(uniform_rows([mu]), own), method, ["claimed"])
         said = bool(batch.faults) or (method != "simplified" and batch.natures[0] != "exact")
         yield batch.predictions[0].covariance[0], said
     except sf.StochfuseError:

@@ -10,10 +10,10 @@ import pytest
 
 import stochfuse as sf
 from stochfuse.estimators.making import PASTS
-from stochfuse.prediction.general import outcomes
 from stochfuse.scenario.scenario import link_rows
 from tests.agreement import test_matrix
 from tests.oracles import strategies, textbook, textbook_estimators
+from tests.oracles.many import outcomes
 
 ONE_STATE = tuple(textbook_estimators.RULES)
 INTERSECTIONS = ("covariance-intersection", "split-ci")

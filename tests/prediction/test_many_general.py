@@ -11,11 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import stochfuse as sf
-from stochfuse.batches import claims, general, optimum
-from stochfuse.errors import NotABatchError
+from stochfuse.engines import contact_chain, enumeration
+from stochfuse.prediction import general, optimal
 from stochfuse.prediction.quantities import matrix
-from stochfuse.scenario.model import Noises
+from stochfuse.scenario.system import Noises
 from tests.oracles import strategies
+from tests.oracles.many import averaged as batch
 
 QUANTITIES = ("claimed", "actual", "bias", "rms")
 ITEMS = 5
@@ -69,21 +70,13 @@ def item(made, noises, i):
 
 def by_agent(found, quantity):
     """A batch's moment per agent, (items, steps, agents, …)."""
-    group_of = {agent: group for group, agents in enumerate(found.groups) for agent in agents}
-    return matrix(quantity, found.moments)[:, :, [group_of[agent] for agent in sorted(group_of)]]
+    return matrix(quantity, found.moments)[:, :, found.group_of]
 
 
 def assert_close(got, wanted, tolerance=1e-12):
     scale = np.abs(wanted).max(axis=(-2, -1), keepdims=True)
     assert got.shape == wanted.shape
     assert (np.abs(got - wanted) <= tolerance * scale).all()
-
-
-def batch(method, scenario, link, noises, **more):
-    if method == "optimal":
-        return optimum.moments(scenario, link, noises, **more)
-    estimator = "naive" if method == "naive" else "local-fusion-graph"
-    return general.moments(scenario, link, noises, estimator, **more)
 
 
 @pytest.mark.parametrize("method", ["general", "naive", "optimal"])
@@ -104,17 +97,17 @@ def test_a_batch_is_its_items(case, method):
         assert_close(by_agent(plain, "claimed")[i], claimed.by_group[0][:, claimed.group_of])
         if method == "optimal":
             # with every link down or up a single item has fewer paths
-            assert claimed.meta["paths"] <= whole.paths
-            assert not whole.bound.any()
+            assert claimed.meta["paths"] <= whole.meta["paths"]
+            assert not np.any(whole.meta["relative_bound"])
         elif 0 < LINK[i] < 1:  # of links that differ, a single item leaves out what cannot happen
-            assert plain.states == claimed.meta["graphs"]
-            assert plain.outcomes == claimed.meta["outcomes"]
+            assert plain.meta["graphs"] == claimed.meta["graphs"]
+            assert plain.meta["outcomes"] == claimed.meta["outcomes"]
 
 
 def test_the_names_of_quantities_are_those_of_predict():
     made = CASES["scalar, ad hoc"]
     noises = noises_of(made)
-    found = general.moments(sf.Scenario.from_mapping(made), LINK, noises, errors=True)
+    found = batch("general", sf.Scenario.from_mapping(made), LINK, noises, errors=True)
     for quantity in QUANTITIES:
         wanted = sf.predict(item(made, noises, 2), [LINK[2]], "general", quantity).by_group[0]
         assert_close(matrix(quantity, found.moments)[2], wanted)
@@ -135,9 +128,9 @@ def test_noises_that_the_scenario_has_itself(kept, method):
 def test_the_best_fusion_by_outcomes():
     made = CASES["two states, broadcast, shared start"]
     noises, scenario = noises_of(made), sf.Scenario.from_mapping(made)
-    found = general.moments(scenario, LINK, noises, "optimal", errors=True).moments
+    found = batch("general", scenario, LINK, noises, estimator="optimal", errors=True).moments
     for quantity in QUANTITIES:
-        wanted = matrix(quantity, optimum.moments(scenario, LINK, noises, errors=True).moments)
+        wanted = matrix(quantity, batch("optimal", scenario, LINK, noises, errors=True).moments)
         assert_close(matrix(quantity, found), wanted, 1e-10)
 
 
@@ -178,16 +171,18 @@ def test_blocks_and_repeated_noises_change_nothing(monkeypatch, errors):
     whole = [run() for run in runs]
     monkeypatch.setattr(general, "BLOCK", 20_000)
     monkeypatch.setattr(general, "CHUNK", 500)
-    monkeypatch.setattr(optimum, "BLOCK", 200)
-    monkeypatch.setattr(claims, "LISTED", 50)
-    claims.claims_of.cache_clear()
+    monkeypatch.setattr(optimal, "BLOCK", 200)
+    monkeypatch.setattr(enumeration, "LISTED", 50)
+    monkeypatch.setattr(enumeration, "MOST_WEIGHTS", 200)
+    monkeypatch.setattr(general, "HELD", 100)
+    general._kept.cache_clear()
     for run, found in zip(runs, whole, strict=True):
         for M, N in zip(found.moments, run().moments, strict=True):
             assert (M is None) == (N is None)
             if M is not None:
                 assert_close(N, M, 1e-13)
-    claims.claims_of.cache_clear()
-    alone = [general.moments(scenario, link[[i]], noises.take([i]), errors=errors) for i in range(40)]
+    general._kept.cache_clear()
+    alone = [batch("general", scenario, link[[i]], noises.take([i]), errors=errors) for i in range(40)]
     np.testing.assert_allclose(whole[0].rounding, [a.rounding[0] for a in alone], rtol=1e-9)
 
 
@@ -223,8 +218,8 @@ def test_an_item_without_an_answer():
     with pytest.raises(sf.NoAnswerError, match=message):
         sf.predict(item(made, noises, 1), [0.5], "general")
     with pytest.raises(sf.NoAnswerError, match=message):
-        general.moments(scenario, link, noises)
-    fine = general.moments(scenario, link[:1], noises.take(slice(0, 1)))
+        batch("general", scenario, link, noises)
+    fine = batch("general", scenario, link[:1], noises.take(slice(0, 1)))
     p = sf.predict(item(made, noises, 0), [0.5], "general")
     assert_close(by_agent(fine, "claimed")[0], p.by_group[0][:, p.group_of])
 
@@ -234,33 +229,30 @@ def test_an_item_with_a_request_that_does_not_fit():
     scenario, noises, link = sf.Scenario.from_mapping(made), noises_of(made), LINK
     singular = noises._replace(P0=noises.P0 * np.array([1, 1, 0, 1, 1])[:, None, None])
     with pytest.raises(sf.UsageError, match=r"initial\.P: expected an invertible covariance"):
-        general.moments(scenario, link, singular)
+        batch("general", scenario, link, singular)
     flat = sf.Scenario.from_mapping(made | {"model": made["model"] | {"F": [[1, 1], [0, 0]]}})
     without = noises._replace(Q=noises.Q * np.array([1, 1, 0, 1, 1])[:, None, None] + np.eye(2) * [[[1], [0]]])
     without.Q[2] = 0.0
     with pytest.raises(sf.UsageError, match="the covariance predicted for step 2 is singular"):
-        general.moments(flat, link, without)
+        batch("general", flat, link, without)
     # the scenario's own covariance is of no account where every item has another
     vague = sf.Scenario.from_mapping(made | {"initial": {"P": [[0, 0], [0, 0]]}})
     np.testing.assert_array_equal(
-        general.moments(vague, link, noises).moments.P, general.moments(scenario, link, noises).moments.P
+        batch("general", vague, link, noises).moments.P, batch("general", scenario, link, noises).moments.P
     )
     with pytest.raises(sf.UsageError, match="more than --max-graphs 2"):
-        general.moments(sf.load_scenario(steps=4), link, Noises(), max_graphs=2)
+        batch("general", sf.load_scenario(steps=4), link, Noises(), max_graphs=2)
     with pytest.raises(sf.UsageError, match="estimator local-fusion-graph: expected agents that track one state"):
-        general.moments(sf.load_scenario("cooperative-pnt"), link, Noises())
+        batch("general", sf.load_scenario("cooperative-pnt"), link, Noises())
     with pytest.raises(sf.UsageError, match="the optimum: expected agents that track one state"):
-        optimum.moments(sf.load_scenario("cooperative-pnt"), link, Noises())
+        batch("optimal", sf.load_scenario("cooperative-pnt"), link, Noises())
     with pytest.raises(sf.UsageError, match="coefficients on noises, expected at most 20000"):
-        general.moments(sf.load_scenario("cv-2d", steps=1000), link, Noises(), errors=True)
+        batch("general", sf.load_scenario("cv-2d", steps=1000), link, Noises(), errors=True)
     with pytest.raises(sf.UsageError, match=r"1\.72e\+361 outcomes make about \d\.\d\de\+\d+ different graphs"):
-        general.moments(sf.load_scenario(steps=200), link, Noises())
+        batch("general", sf.load_scenario(steps=200), link, Noises())
     correlated = sf.Scenario.from_mapping(CASES["correlated noises"])
     with pytest.raises(sf.UsageError, match="the optimum: expected independent measurement noises"):
-        optimum.moments(correlated, link, noises_of(CASES["correlated noises"]))
-
-
-BURST = {"good_to_bad": 0.1, "bad_to_good": 0.3}
+        batch("optimal", correlated, link, noises_of(CASES["correlated noises"]))
 
 
 def disturbed():
@@ -268,29 +260,34 @@ def disturbed():
 
 
 @pytest.mark.parametrize(
-    ("call", "message"),
+    ("made", "method", "settings"),
     [
-        (lambda n: general.moments(sf.load_scenario(), np.zeros((5, 3, 3)), n), r"one link probability for each item, got an array of shape \(5, 3, 3\)"),
-        (lambda n: optimum.moments(sf.load_scenario(), np.zeros((5, 3, 3)), n), r"one link probability for each item, got an array of shape \(5, 3, 3\)"),
-        (lambda n: general.moments(sf.Scenario.from_mapping(source(burst=BURST)), LINK, n), r"a batch: expected links without memory, got network\.burst"),
-        (lambda n: optimum.moments(sf.Scenario.from_mapping(source(burst=BURST)), LINK, n), r"a batch: expected links without memory, got network\.burst"),
-        (lambda n: general.moments(sf.Scenario.from_mapping(CASES["unlike agents"]), LINK, n), "expected like sensors, got unlike ones"),
-        (lambda n: optimum.moments(sf.Scenario.from_mapping(CASES["unlike agents"]), LINK, n), "expected like sensors, got unlike ones"),
-        (lambda n: general.moments(sf.load_scenario(), LINK, n, "covariance-intersection"), "expected estimator local-fusion-graph, naive, optimal, got 'covariance-intersection'"),
-        (lambda n: general.moments(sf.Scenario.from_mapping(disturbed()), LINK, n, errors=True), r"expected no noise\.disturbance, got one"),
-        (lambda n: optimum.moments(sf.load_scenario(agents=40, steps=20), LINK, n), "a batch by method optimal: the contact chain has .* paths or more"),
-        (lambda n: optimum.moments(sf.load_scenario("cv-2d", agents=6, steps=20), LINK, Noises()), "a batch by method optimal: the contact chain has .* paths or more"),
+        (source(), "general", {"estimator": "covariance-intersection"}),
+        (source(2, 1, agents=2), "general", {"estimator": "split-ci"}),
+        (disturbed(), "general", {"errors": True}),
+        (source(2, 1, agents=3, steps=5), "optimal", {}),
     ],
-)  # fmt: skip
-def test_what_is_no_batch(call, message):
-    with pytest.raises(NotABatchError, match=message):
-        call(Noises(R=np.linspace(1, 2, ITEMS)[:, None, None]))
+)
+def test_what_cannot_be_side_by_side_goes_one_set_of_noises_after_the_other(made, method, settings, monkeypatch):
+    if method == "optimal":
+        monkeypatch.setattr(contact_chain, "MOST_PATHS", 10)
+    noises = noises_of(made)
+    found = batch(method, sf.Scenario.from_mapping(made), LINK, noises, **settings)
+    more = {k: v for k, v in settings.items() if k != "errors"}
+    p = sf.predict(item(made, noises, 3), [LINK[3]], method, "actual" if "errors" in settings else "claimed", **more)
+    assert_close(by_agent(found, p.quantity if "errors" in settings else "claimed")[3], p.by_group[0][:, p.group_of])
+
+
+def test_unlike_sensors_have_no_common_noise():
+    scenario = sf.Scenario.from_mapping(CASES["unlike agents"])
+    with pytest.raises(sf.UsageError, match="R: expected like sensors to have a noise of the item's own"):
+        sf.predict_many(scenario, LINK, R=np.linspace(1, 2, ITEMS), method="general")
 
 
 def test_disturbances_without_noises_of_their_own():
     made = disturbed()
     noises = noises_of(made)._replace(R=None)
-    found = general.moments(sf.Scenario.from_mapping(made), LINK, noises, errors=True)
+    found = batch("general", sf.Scenario.from_mapping(made), LINK, noises, errors=True)
     p = sf.predict(item(made, noises, 3), [LINK[3]], "general", quantity="actual")
     assert_close(by_agent(found, "actual")[3], p.by_group[0][:, p.group_of])
 
@@ -300,11 +297,10 @@ def test_numbers_beyond_floating_point():
     made["model"]["F"] = 1e10
     scenario = sf.Scenario.from_mapping(made)
     noises = Noises(Q=np.array([1.0, 1e308])[:, None, None], R=np.full((2, 1, 1), 1e307), P0=np.full((2, 1, 1), 1e300))
-    with (
-        np.errstate(all="ignore"),
-        pytest.raises(NotABatchError, match="expected a finite optimum, got one that is not"),
-    ):
-        optimum.moments(scenario, np.array([0.5, 0.5]), noises)
+    with np.errstate(all="ignore"):
+        p = sf.predict_many(scenario, [0.5, 0.5], noises.Q, noises.R, noises.P0, method="optimal")
+    assert list(p.meta["faults"]) == [0, 1]
+    assert "grows beyond" in p.meta["faults"][1] or "not finite" in p.meta["faults"][1]
 
 
 KINDS = [
@@ -339,25 +335,20 @@ def test_what_is_kept_of_one_scenario_is_not_taken_for_another(asked):
 
 def test_outcomes_are_gone_through_once():
     made = source(2, 2, agents=3, steps=3, architecture="broadcast")
-    claims.claims_of.cache_clear()
+    general._kept.cache_clear()
     for seed in range(4):
-        general.moments(sf.Scenario.from_mapping(made), LINK, noises_of(made, seed))
-    assert claims.claims_of.cache_info()[:2] == (3, 1)
-    for agents in range(1, claims.MOST_KEPT + 3):
-        general.moments(sf.load_scenario(agents=agents, architecture="cyclic", steps=1), LINK, Noises())
-    assert claims.claims_of.cache_info().currsize == claims.MOST_KEPT
+        batch("general", sf.Scenario.from_mapping(made), LINK, noises_of(made, seed))
+    assert general._kept.cache_info()[:2] == (3, 1)
+    for agents in range(1, general.KEPT + 3):
+        batch("general", sf.load_scenario(agents=agents, architecture="cyclic", steps=1), LINK, Noises())
+    assert general._kept.cache_info().currsize == general.KEPT
 
 
-@given(st.lists(st.lists(st.integers(-1, 3), min_size=3, max_size=3), min_size=1, max_size=30))
-def test_different_rows(rows):
-    different, of = claims._unique_rows(np.array(rows))
-    assert different[of].tolist() == rows
-    assert len({tuple(row) for row in rows}) == len(different)
-
-
-def test_different_rows_that_share_their_number():
-    a, b = (np.random.default_rng(0).integers(1 << 62, size=2) | 1).tolist()
-    rows = np.array([[b, 0], [0, a], [b, 0]])
-    different, of = claims._unique_rows(rows)
-    assert len(different) == 2
-    np.testing.assert_array_equal(different[of], rows)
+def test_different_claims_that_share_their_first_number():
+    """Two sums whose first random numbers happen to be equal are told by the second."""
+    view = enumeration.View(
+        np.array([[0, 1, -1]]), ((1, np.array([0, 1, 2])), (1, np.array([2, 2, 2]))), np.arange(3), np.eye(3), []
+    )
+    signatures = np.array([[7, 1], [7, 2], [0, 0]], dtype=np.uint64)
+    keys = enumeration._keys(view, slice(None), signatures)
+    assert len(set(keys.ravel().tolist())) == 3

@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import stochfuse as sf
-from stochfuse.batches.simplified import covariances
 from stochfuse.engines.mean_field import BLOCK
 from stochfuse.kalman.averaged_update import sound
 from stochfuse.kalman.checks import covariance_fault
-from stochfuse.prediction.simplified import faults
-from stochfuse.scenario.model import Noises
+from stochfuse.prediction.simplified import averaged, faults
+from stochfuse.scenario.system import Noises
 from tests.oracles import textbook
+from tests.oracles.many import covariances, items_of
 from tests.oracles.strategies import covariance, mapping, model, seeds
 
 SHAPES = ((1, 1), (1, 2), (2, 1), (4, 2), (3, 3))
@@ -283,30 +283,81 @@ def test_the_cheap_check_is_the_exact_one(seed, d, depth):
 
 
 def network(**settings):
-    return {**mapping(1.0, 1.0, 1.0, 1.0, 1.0, agents=3, steps=2, **settings)}
+    return {**mapping(1.0, 1.0, 1.0, 1.0, 1.0, agents=3, steps=3, **settings)}
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        network() | {"agent": [{}, {"R": 2.0}, {}]},
+        network(hears=[[2], [1, 3], [2]]),
+        network() | {"agent": [{}, {"sensor": False}, {"H": 2.0}]},
+    ],
+)
+def test_unlike_agents_and_masks_are_items_too(source):
+    """Agents that are not alike go through the noises one by one; the answers are those of one scenario each."""
+    link, noises = np.array([0.1, 0.5, 0.9]), Noises(Q=np.array([[[1.0]], [[2.0]], [[1.0]]]))
+    scenario = sf.Scenario.from_mapping(source)
+    got = averaged(scenario.system, items_of(scenario, link, noises))
+    for i, mu in enumerate(link):
+        own = {**source, "model": {**source["model"], "Q": noises.Q[i].tolist()}}
+        alone = sf.predict(sf.Scenario.from_mapping(own), [mu])
+        np.testing.assert_allclose(got.moments.P[i][:, got.group_of], alone.by_group[0][:, alone.group_of], rtol=1e-12)
 
 
 @pytest.mark.parametrize(
     ("source", "message"),
     [
         (network(delay=[0.5, 0.5]), r"method 'simplified' is derived without delay \(thesis 4.2\)"),
-        (
-            network() | {"agent": [{}, {"R": 2.0}, {}]},
-            "a batch of the simplified formulation: expected like agents, got 2 kinds of sensors",
-        ),
-        (network(hears=[[2], [1, 3], [2]]), "expected agents that may hear all others"),
-        (
-            network(burst={"good_to_bad": 0.1, "bad_to_good": 0.5, "good": 0.9, "bad": 0.1}),
-            r"does not take bursty links \(network.burst\): one link probability per item",
-        ),
         (network() | {"noise": {"correlation": 0.5}}, "expected independent measurement noises"),
     ],
 )
-def test_what_makes_no_batch_is_refused(source, message):
+def test_what_one_scenario_is_refused_for_many_are(source, message):
     with pytest.raises(sf.UsageError, match=message):
         covariances(sf.Scenario.from_mapping(source), np.array([0.5]), Noises())
 
 
-def test_agents_with_states_of_their_own_make_no_batch():
+def test_agents_with_states_of_their_own_are_refused():
     with pytest.raises(sf.UsageError, match="expected agents that track one state by one model"):
         covariances(sf.load_scenario("cooperative-pnt"), np.array([0.5]), Noises())
+
+
+def test_many_scenarios_in_one_call():
+    """`sf.predict_many`: numbers for multiples of the identity, a fault where an item has no answer."""
+    s = sf.load_scenario("cv-2d", steps=4)
+    rng = np.random.default_rng(0)
+    link, R = rng.uniform(size=6), rng.uniform(1.0, 100.0, size=6)
+    P = np.array([covariance(rng, 4) + np.eye(4) for _ in range(6)])
+    for method in ("simplified", "general", "optimal"):
+        p = sf.predict_many(s, link, R=R, P=P, method=method)
+        assert p.covariance.shape == (6, 4, 4, 4)
+        source = s.to_mapping()
+        source["model"]["R"], source["initial"]["P"] = float(R[3]), P[3].tolist()
+        alone = sf.predict(sf.Scenario.from_mapping(source), [link[3]], method)
+        np.testing.assert_allclose(p.covariance[3], alone.covariance[0], rtol=1e-11, atol=1e-12)
+    one = sf.predict_many(s, R=R, link=[0.5])
+    assert one.covariance.shape == (6, 4, 4, 4)
+    growing = sf.Scenario.from_mapping(
+        mapping(1e40 * np.eye(2), np.eye(2), np.eye(1, 2), 1.0, np.eye(2), agents=2, steps=4)
+    )
+    p = sf.predict_many(growing, [0.5, 0.5], R=[1.0, 1e300], P=[1e-20, 1e100])
+    assert list(p.meta["faults"]) == [1]
+    assert np.isnan(p.covariance[1]).all()
+    assert np.isfinite(p.covariance[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"Q": np.zeros((3, 2, 2))}, r"Q: expected an array of shape \(items, 1, 1\), or \(items,\), got \(3, 2, 2\)"),
+        ({"R": [1.0, 0.0]}, "R: expected covariances, got a variance of 0 on the diagonal"),
+        ({"P": [1.0, -1.0]}, "P: expected covariances, got a variance of -1 on the diagonal"),
+        ({"link": [0.1, 0.2], "R": [1.0, 2.0, 3.0]}, "link: expected 3 items, as many as the other arrays have, got 2"),
+        ({"R": [1.0, 2.0]}, "link: expected one link probability per item, since the scenario has none of its own"),
+        ({"Q": "much"}, "Q: expected an array of shape"),
+        ({"link": [0.5, 1.5]}, "link: expected probabilities between 0 and 1, got 1.5"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_named(arrays, message):
+    with pytest.raises(sf.UsageError, match=message):
+        sf.predict_many(sf.load_scenario(), **arrays)

@@ -12,7 +12,6 @@ import pyarrow.parquet as pq
 import pytest
 
 import stochfuse as sf
-from stochfuse import batches
 from stochfuse.studies import evaluation
 from stochfuse.studies.files import packed, unpacked
 from stochfuse.studies.plan import put
@@ -46,13 +45,13 @@ def expected(row, scenario="thesis-transient", quantity="claimed", metric="trace
 @pytest.fixture
 def sizes(monkeypatch):
     """Sizes of the batches that are predicted."""
-    sizes, predict = [], batches.predict
+    sizes, predict = [], evaluation.predict_items
 
     def spy(scenario, link, noises, *arguments, **settings):
         sizes.append(len(link))
         return predict(scenario, link, noises, *arguments, **settings)
 
-    monkeypatch.setattr(evaluation.batches, "predict", spy)
+    monkeypatch.setattr(evaluation, "predict_items", spy)
     return sizes
 
 

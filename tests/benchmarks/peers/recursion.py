@@ -22,9 +22,10 @@ from stonesoup.types.state import GaussianState
 from stonesoup.updater.kalman import KalmanUpdater
 
 import stochfuse as sf
-from stochfuse.batches import simplified
 from stochfuse.kalman import kernel as kalman
-from stochfuse.scenario.model import Noises
+from stochfuse.prediction import simplified
+from stochfuse.scenario.network import uniform_rows
+from stochfuse.scenario.system import Items, Noises
 from tests.benchmarks.peers.ways import (
     FILTERPY,
     OURS,
@@ -171,7 +172,7 @@ class Batch:
         self.link, self.noises = np.full(len(Q), µ), Noises(Q, R, P0)
 
     def __call__(self) -> np.ndarray:
-        return simplified.covariances(self.scenario, self.link, self.noises).P[:, -1]
+        return simplified.covariances(self.scenario.system, Items(uniform_rows(self.link), self.noises)).P[:, -1, 0]
 
 
 def one_by_one(work: Work, agents: int, µ: float) -> np.ndarray:
