@@ -464,10 +464,12 @@ def _keys(view: View, states: slice, signatures: np.ndarray | None) -> np.ndarra
         part = signatures[ids[:, index]]
         keys = keys + part if sign > 0 else keys - part
     first = np.ascontiguousarray(keys[..., 0])
-    # two different claims share a number once in 10^19 pairs: the second number tells, and then both count
-    _, where, of = np.unique(first, return_index=True, return_inverse=True)
-    same = keys.reshape(-1, 2)[where[of.ravel()], 1] == keys.reshape(-1, 2)[:, 1]
-    return first if same.all() else np.unique(keys.reshape(-1, 2), axis=0, return_inverse=True)[1].reshape(first.shape)
+    # two different claims share a number once in 10^19 pairs: where the second number differs, both count
+    order = np.argsort(first, axis=None, kind="stable")
+    one, other = first.ravel()[order], keys[..., 1].ravel()[order]
+    if not ((one[1:] == one[:-1]) & (other[1:] != other[:-1])).any():
+        return first
+    return np.unique(keys.reshape(-1, 2), axis=0, return_inverse=True)[1].reshape(first.shape)
 
 
 class _Gathered:
@@ -486,18 +488,17 @@ class _Gathered:
 
     def add(self, states: slice, keys: np.ndarray, factor_of: np.ndarray) -> None:
         """Add up the weights of some states' outcomes."""
-        view = self.view
-        found, first, of = np.unique(keys, return_index=True, return_inverse=True)
+        view, flat = self.view, keys.ravel()
+        order = np.argsort(flat, kind="stable")
+        sorted_keys = flat[order]
+        starts = np.flatnonzero(np.concatenate([[True], sorted_keys[1:] != sorted_keys[:-1]]))
         before = len(self.place)
-        at = np.array([self.place.setdefault(key, len(self.place)) for key in found.tolist()])
-        row, cell = np.divmod(first[at >= before], keys.shape[1])
+        at = np.array([self.place.setdefault(key, len(self.place)) for key in sorted_keys[starts].tolist()])
+        row, cell = np.divmod(order[starts[at >= before]], keys.shape[1])
         self._ids.append(np.stack([view.ids[states][row, index[cell]] for _, index in view.terms], axis=-1))
         pairs = self.weights.pairs(self.ending.weights[states], view.factors)
         pair_of = (np.arange(len(keys))[:, None] * len(view.factors) + factor_of).ravel()
-        order = np.argsort(of.ravel(), kind="stable")
-        starts = np.searchsorted(of.ravel()[order], np.arange(len(found)))
-        flat = pairs.reshape(-1, pairs.shape[-1])
-        part = np.add.reduceat(flat[pair_of[order]], starts, axis=0)
+        part = np.add.reduceat(pairs.reshape(-1, pairs.shape[-1])[pair_of[order]], starts, axis=0)
         self._grow(part.shape[1])
         self._total[at] += part
 

@@ -9,8 +9,9 @@ All three make `Items` of a `System` and ask one method for their moments.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -18,11 +19,9 @@ import numpy as np
 from stochfuse.engines.precision import told
 from stochfuse.errors import StochfuseError, UsageError
 from stochfuse.kalman.checks import covariance_fault
-from stochfuse.prediction import general, optimal, sampled, simplified, states
 from stochfuse.prediction.method import RUNS, Averaged, Settings, faults_of
 from stochfuse.prediction.quantities import QUANTITIES
 from stochfuse.prediction.result import Prediction
-from stochfuse.prediction.steady_state import steady_state
 from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.registry import CRITERIA, ESTIMATORS, METHODS
 from stochfuse.scenario.scenario import Scenario, link_rows
@@ -35,6 +34,14 @@ CENTRE = (
     "the links: not to be compared with the optimum of what arrived"
 )
 NO_ERROR = "the scenario has no known initial error (initial.error): the bias is 0, the RMS error that of the noise"
+FILE = {
+    "simplified": "simplified",
+    "general": "general",
+    "naive": "general",
+    "optimal": "optimal",
+    "monte-carlo": "sampled",
+}
+"""Where each method is, imported when it is asked for."""
 WORTHLESS = 1e-3
 """Relative rounding beyond which it is no answer."""
 
@@ -95,7 +102,7 @@ def predict(
     prediction = _prediction(scenario, rows, method, quantity, found)
     if not steady:
         return prediction
-    fixed = steady_state(scenario, rows)
+    fixed = _room("steady_state").steady_state(scenario, rows)
     return prediction.with_steady(fixed.P, fixed.bound)
 
 
@@ -202,7 +209,9 @@ def predict_items(
         first = _prediction(scenario, items.links, way, hardest, found)
         predictions |= {q: first if q == hardest else first.shown_as(q) for q in some}
         lost = {int(i): told(found.rounding[i]) for i in np.flatnonzero(found.rounding > WORTHLESS)}
-        faults |= {**faults_of(found.moments), **lost, **found.faults}
+        # the mean field looks for faults itself, at a fraction of the cost
+        wrong = {} if way == "simplified" else faults_of(found.moments)
+        faults |= {**wrong, **lost, **found.faults}
         natures.append(found.natures)
     certain = ("exact", "sampled", "approximate", "bound")
     worst = np.max([np.vectorize(certain.index, otypes=[int])(nature) for nature in natures], axis=0)
@@ -284,16 +293,9 @@ def _asked(scenario: Scenario, method: str | None, quantity: str, settings: Mapp
 
 def _averaged(system: System, items: Items, method: str, how: Settings, quantity: str) -> Averaged:
     errors = quantity not in ("claimed", "optimal")
-    engines: dict[str, Callable[[], Averaged]] = {
-        "simplified": lambda: simplified.averaged(system, items),
-        "general": lambda: general.averaged(system, items, how, errors),
-        "naive": lambda: general.averaged(system, items, how, errors),
-        "optimal": lambda: optimal.averaged(system, items, how, errors),
-        "monte-carlo": lambda: sampled.averaged(system, items, how, errors),
-    }
-    found = engines[method]()
+    found = _room(FILE[method]).averaged(system, items, how, errors)
     if method == "simplified" and errors:
-        found = states.with_errors(system, items, found)
+        found = _room("states").with_errors(system, items, found)
     first = [NAIVE] if how.estimator == "naive" and method in ("general", "naive") and not errors else []
     said = []
     if found.estimator == "itns" and not system.own:
@@ -301,6 +303,11 @@ def _averaged(system: System, items: Items, method: str, how: Settings, quantity
     if quantity in ("bias", "rms") and system.error is None:
         said.append(NO_ERROR)
     return found._replace(notes=(*first, *found.notes, *said))
+
+
+def _room(file: str) -> Any:
+    """A file of this room, imported when it is asked for: without the others a plain `predict` starts a third sooner."""
+    return import_module(f"stochfuse.prediction.{file}")
 
 
 def _prediction(scenario: Scenario, rows: LinkRows, method: str, quantity: str, found: Averaged) -> Prediction:

@@ -44,7 +44,7 @@ from stochfuse.kalman.averaged_update import noise_factor, sound
 from stochfuse.kalman.checks import first_fault
 from stochfuse.kalman.kernel import Estimate, from_information, to_information, update, update_information
 from stochfuse.kalman.metrics import Moments
-from stochfuse.prediction.method import Averaged, joined
+from stochfuse.prediction.method import Averaged, Settings, joined
 from stochfuse.scenario.network import LinkRows, Network, number_of_senders, possible_senders, require_memoryless
 from stochfuse.scenario.system import Items, Noises, System
 
@@ -126,7 +126,7 @@ class Covariances(NamedTuple):
     cancelled: np.ndarray
 
 
-def averaged(system: System, items: Items) -> Averaged:
+def averaged(system: System, items: Items, how: Settings = Settings(), errors: bool = False) -> Averaged:  # noqa: B008
     """Evaluate (54) as a method, see `Averaged`; errors are added by `stochfuse.prediction.states.with_errors`.
 
     Raises

@@ -91,7 +91,9 @@ def predict_states(
     z = np.asarray(measurements, dtype=float)
     system = scenario.system
     steps, n = system.steps, system.agents
-    widths = {sensor.H.shape[-2] for sensor in scenario.sensors}
+    sees = np.array([scenario.sensors[kind].H.shape[-2] for kind in scenario.sensor_of])
+    # what agents without a sensor are said to measure does not matter
+    widths = set(sees[sees > 0].tolist()) or {z.shape[-1] if z.ndim else 0}
     expected = (
         f"(steps, p) or (steps, agents, p) with {steps} steps, {n} agents and p = {', '.join(map(str, sorted(widths)))}"
     )
@@ -99,14 +101,16 @@ def predict_states(
         raise UsageError(f"measurements: expected shape {expected}, got {z.shape}")
     if z.ndim == 3 and z.shape[1] != n:
         raise UsageError(f"measurements: expected shape {expected}, got {z.shape}")
-    if not np.isfinite(z[1:steps]).all():
+    if not np.isfinite(z[1:steps] if z.ndim == 2 else z[1:steps, sees > 0]).all():
         raise UsageError("measurements: expected finite numbers, got NaN or infinity")
-    if z.ndim == 2 and len(scenario.sensors) == 1:
+    if z.ndim == 2 and len(scenario.sensors) == 1 and sees.all():
         x = _one_record(system, rows, z, printed)
     elif printed:
         raise UsageError("(53) as printed takes one record for all agents, of shape (steps, p)")
     else:
-        x = _own_records(system, rows, np.broadcast_to(z[:, None], (len(z), n, z.shape[-1])) if z.ndim == 2 else z)
+        own = np.broadcast_to(z[:, None], (len(z), n, z.shape[-1])) if z.ndim == 2 else z
+        blank = np.zeros(1)
+        x = _own_records(system, rows, [[r if s else blank for r, s in zip(now, sees, strict=True)] for now in own])
     return States(rows.means(scenario.network), np.arange(1, steps + 1), x[..., 0], scenario.model.states)
 
 
