@@ -441,7 +441,7 @@ def square(Z: np.ndarray) -> np.ndarray:
 
 MOST_PAIR_STEPS = 200
 EQUAL = 2e-15
-"""Largest |δ| per dimension of two covariances that are equal to rounding."""
+"""Largest |δ| per dimension of two covariances that are equal to rounding, and 1 − |δ| of which one has no error."""
 
 
 class Pairs(NamedTuple):
@@ -506,7 +506,9 @@ def diagonalise(A: np.ndarray, B: np.ndarray, *, basis: bool = True) -> Pairs:
         delta, T = np.linalg.eigvalsh(difference), np.empty((len(A), 0, 0))
     if delta.size and np.abs(delta).max() > 1.0 + 1e-6:
         raise UsageError("pairs: expected positive semi-definite matrices, got an indefinite one")
-    delta = np.clip(delta, -1.0, 1.0)
+    # what rounding leaves of a direction without error is none: it would call for a weight of its square root
+    certain = 1.0 - np.abs(delta) <= EQUAL * delta.shape[-1]
+    delta = np.where(certain, np.sign(delta), np.clip(delta, -1.0, 1.0))
     return Pairs(T, 0.5 * (1.0 - delta), 0.5 * (1.0 + delta), delta)
 
 

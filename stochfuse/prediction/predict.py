@@ -306,7 +306,7 @@ def _averaged(system: System, items: Items, method: str, how: Settings, quantity
 
 
 def _room(file: str) -> Any:
-    """A file of this room, imported when it is asked for: without the others a plain `predict` starts a third sooner."""
+    """A file of this room, imported when it is asked for: without the others a `predict` starts a third sooner."""
     return import_module(f"stochfuse.prediction.{file}")
 
 

@@ -123,6 +123,10 @@ SCHEMA = "stochfuse.study-summary/1"
 PARETO_SCHEMA = "stochfuse.pareto/1"
 
 
+ROUNDING = 1e-12
+"""Relative difference of values that are equal: which is the larger is the machine's business."""
+
+
 class Extreme(NamedTuple):
     """The least or greatest value of a column, and where it is.
 
@@ -160,7 +164,7 @@ class Summary:
 
 
 def summarise(results: Results) -> Summary:
-    """Go through the results once, block by block; of equal extremes the first point is named."""
+    """Go through the results once, block by block; of extremes that are equal to rounding the first point is named."""
     plan = results.plan
     keys = [axis.name for axis in plan.axes]
     asked = tuple(dict.fromkeys(["point", "step", *keys, *HOW, *plan.columns]))
@@ -173,10 +177,12 @@ def summarise(results: Results) -> Summary:
             values = np.asarray(block[column], dtype=float)
             if np.isnan(values).all():  # standard errors of points that are not sampled
                 continue
-            for extreme, sign, where in (("least", 1, np.nanargmin), ("greatest", -1, np.nanargmax)):
-                here = _extreme(column, extreme, block, int(where(values)), keys)
+            for extreme, sign in (("least", 1), ("greatest", -1)):
                 best = found.get((column, extreme))
-                if best is None or sign * (best.value - here.value) > 0:
+                end = sign * np.nanmin(sign * values)
+                near = np.abs(values - end) <= ROUNDING * np.abs(end)
+                here = _extreme(column, extreme, block, int(near.argmax()), keys)
+                if best is None or sign * (best.value - here.value) > ROUNDING * abs(best.value):
                     found[column, extreme] = here
     order = [(column, extreme) for column in plan.columns for extreme in ("least", "greatest")]
     return Summary(tuple(found[at] for at in order if at in found), dict(sorted(natures.items())))
