@@ -125,5 +125,10 @@ def __getattr__(name: str) -> Any:
     return getattr(import_module(f"stochfuse.{_HOME[name]}"), name)
 
 
+def as_text(prediction: Any, of: str, agent: int | str) -> str:
+    """Return a prediction's table as text; the door through which a result reaches what shows it."""
+    return import_module("stochfuse.report.predictions").text_of(prediction, of, agent)
+
+
 def __dir__() -> list[str]:
     return __all__

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+import stochfuse
 from stochfuse.errors import UsageError
 from stochfuse.kalman.metrics import Metric, Moments, metric
 from stochfuse.prediction.quantities import linear, matrix, number, value
@@ -174,10 +175,7 @@ class Prediction:
 
     def table(self, of: str = "trace", agent: int | str = "mean") -> str:
         """Return the table as text, as `stochfuse predict` prints it."""
-        from stochfuse.report.predictions import View, predict_table
-        from stochfuse.report.table import to_text
-
-        return to_text(predict_table(View(self, metric(of, self.scenario.model), agent)), width=None)
+        return stochfuse.as_text(self, of, agent)
 
     def with_steady(self, P: np.ndarray, bound: np.ndarray) -> Prediction:
         """Return the same with its steady state."""

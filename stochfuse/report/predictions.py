@@ -16,13 +16,12 @@ import numpy as np
 from stochfuse import __version__
 from stochfuse.engines.distribution import parse_statistic
 from stochfuse.errors import StochfuseError, UsageError
-from stochfuse.kalman.metrics import Metric, power
+from stochfuse.kalman.metrics import Metric, metric, power
 from stochfuse.prediction.quantities import OVERCONFIDENT, expectation, noun, title
 from stochfuse.prediction.quantities import unit as unit_of
 from stochfuse.prediction.result import Prediction
-from stochfuse.report import predictions
 from stochfuse.report.plot import MARKERS, figure_class, spread
-from stochfuse.report.table import Table, number, to_csv, write_file
+from stochfuse.report.table import Table, number, to_csv, to_text, write_file
 
 SCHEMA = "stochfuse.prediction/1"
 METHOD_TITLES = {
@@ -225,6 +224,12 @@ def _finite(values: np.ndarray) -> np.ndarray:
     return values
 
 
+def text_of(prediction: Prediction, of: str, agent: int | str) -> str:
+    """Return the table of a prediction as text of any width."""
+    view = View(prediction, metric(of, prediction.scenario.model), agent)
+    return to_text(predict_table(view), width=None)
+
+
 def predict_table(view: View) -> Table:
     """Return rows of link probabilities (or cases) against columns of steps."""
     p = view.prediction
@@ -346,13 +351,13 @@ def side_table(views: Sequence[View]) -> Table:
 
 def side_csv(views: Sequence[View]) -> str:
     """Return the records of one quantity after the other."""
-    first, *others = (predictions.predict_csv(view) for view in views)
+    first, *others = (predict_csv(view) for view in views)
     return first + "".join(text.partition("\n")[2] for text in others)
 
 
 def side_json(views: Sequence[View]) -> dict[str, Any]:
     """Return the object of the first quantity, with all of them under `quantities`."""
-    each = {view.prediction.quantity: predictions.predict_json(view) for view in views}
+    each = {view.prediction.quantity: predict_json(view) for view in views}
     kept = ("values", "standard_error", "interval", "bernstein")
     return {
         **each[views[0].prediction.quantity],

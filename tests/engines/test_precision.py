@@ -256,7 +256,7 @@ def test_weights_of_intersections_are_optimal_to_fifty_digits_or_refused():
         (correlated(rng, 4), np.eye(4)),
         (1e12 * covariance(rng, 3) + 1e12 * np.eye(3), covariance(rng, 3) + np.eye(3)),
         # of rank one exactly: a product of rounded factors has eigenvalues of 1e-16 or none, as the machine rounds
-            (np.outer([3.0, -1.0, 2.0], [3.0, -1.0, 2.0]), covariance(rng, 3) + np.eye(3)),
+        (np.outer([3.0, -1.0, 2.0], [3.0, -1.0, 2.0]), covariance(rng, 3) + np.eye(3)),
     ]
     for A, B in pairs:
         try:
