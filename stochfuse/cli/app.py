@@ -27,6 +27,8 @@ COMMANDS = (
 )
 """Each has a module in `stochfuse.cli`, with a function of the same name, or with an `app` of its own commands."""
 
+WRONG_WORDS = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
+"""What is raised for words that are no command line; Typer brings its own click, or uses the one that is installed."""
 EXIT_FAILURE, EXIT_USAGE, EXIT_NO_ANSWER, EXIT_INTERRUPTED = 1, 2, 3, 130
 
 
@@ -50,6 +52,11 @@ class Group(TyperGroup):
         command.name = cmd_name
         return command
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Take --debug wherever it stands."""
+        ctx.obj = "--debug" in args
+        return super().parse_args(ctx, [word for word in args if word != "--debug"] if ctx.obj else args)
+
     def invoke(self, ctx: Any) -> Any:
         """Run the chosen command."""
         try:
@@ -72,6 +79,13 @@ class Group(TyperGroup):
             _fail(f"error: cannot write to standard output: {error.strerror or error}", EXIT_FAILURE)
         except KeyboardInterrupt:
             _fail("interrupted", EXIT_INTERRUPTED)
+        except (typer.Exit, typer.Abort, WRONG_WORDS):
+            raise
+        except Exception as error:
+            if ctx.obj:
+                raise
+            what = " ".join(f"{type(error).__name__}: {error}".split())
+            _fail(f"internal error: {what}; --debug shows where", EXIT_FAILURE)
 
 
 def _silence() -> None:
@@ -104,6 +118,7 @@ def options(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and stop.")
     ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show where an internal error happened.")] = False,
 ) -> None:
     """How good will the fused estimate be, as a function of the link probability?
 

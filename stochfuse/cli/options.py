@@ -166,10 +166,20 @@ PlotOption = Annotated[Path | None, typer.Option(metavar="FILE", help="Also draw
 
 
 def whose(agent: str | None, scenario: Scenario) -> int | str:
-    """Return the agent asked for: a number, or mean, worst or best."""
-    if agent is None:
-        return scenario.agent or "mean"
-    return int(agent) if agent.isdigit() else agent
+    """Return the agent asked for: a number, or mean, worst or best.
+
+    Raises
+    ------
+    UsageError
+        If there is no such agent.
+    """
+    from stochfuse.errors import UsageError
+
+    chosen = (scenario.agent or "mean") if agent is None else int(agent) if agent.isdigit() else agent
+    most = scenario.network.agents
+    if chosen not in ("mean", "worst", "best") and not (isinstance(chosen, int) and 1 <= chosen <= most):
+        raise UsageError(f"agent: expected mean, worst, best or a number from 1 to {most}, got '{agent}'")
+    return chosen
 
 
 def load(

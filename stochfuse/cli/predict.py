@@ -111,6 +111,7 @@ def predict(
     check_files(output, plot, scenario)
     quantities = quantity_names(quantity)
     given, links = load(scenario, agents, steps, architecture, q, r, p0, link)
+    chosen_agent = whose(agent, given)
     chosen = metric_of(metric or given.metric or "trace", given.model)
     for name in quantities:
         check(name, chosen)
@@ -137,7 +138,6 @@ def predict(
             criterion=criterion,
         ),
     }
-    chosen_agent = whose(agent, given)
     with _progress(way) as settings["progress"]:
         found = run(given, links, way.value, quantities, **settings)
         at_zero = run(given, [0.0], way.value, quantities, **settings) if normalise else [None] * len(found)

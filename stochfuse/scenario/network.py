@@ -121,9 +121,9 @@ class LinkRows:
         if self.uniform:
             return self.link.mean(axis=1) if self.varies else self.link
         steps = range(1, network.steps + 1 if self.varies else 2)
-        there = slice(None)
-        if network.hears is not None:
-            there = np.take_along_axis(network.hears, possible_senders(network.architecture, network.agents), axis=1)
+        there = np.take_along_axis(reachable(network), possible_senders(network.architecture, network.agents), axis=1)
+        if not there.any():  # nobody hears anybody: as good as links of probability 0
+            return np.zeros(len(self.link))
         return np.mean(
             [self.matrices(network, k)[:, there].reshape(len(self.link), -1).mean(axis=1) for k in steps], axis=0
         )

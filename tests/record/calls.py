@@ -170,7 +170,9 @@ def _questions() -> Iterator[tuple[str, Callable[[], Any]]]:
         for method in ("simplified", "general", "optimal"):
             yield (
                 f"sensitivity {name} {method}",
-                lambda n=name, m=method: sf.sensitivity(scenario(n), None if n == "matrix" else [0.5], method=m).slope,
+                lambda n=name, m=method: (
+                    sf.sensitivity(scenario(n), None if n == "matrix" else [0.5], method=m).derivative
+                ),
             )
             yield (
                 f"gain {name} {method}",
@@ -226,7 +228,9 @@ def _lines() -> Iterator[tuple[str, Callable[[], Any]]]:
     lines = [f"predict {p} --steps 2 --format json" for p in PRESETS]
     lines += [f"predict {p} --steps 2 --format csv --link 0.5" for p in PRESETS]
     lines += [
-        f"predict --method {m} --steps 3 --quantity {q} --format json --runs 50" for m in METHODS for q in QUANTITIES
+        f"predict --method {m} --steps 3 --quantity {q} --format json{' --runs 50' * (m == METHODS[-1])}"
+        for m in METHODS
+        for q in QUANTITIES
     ]
     lines += [
         f"predict --architecture {a} --method {m} --steps 3 --format json --link 0:1:0.25"
@@ -259,7 +263,7 @@ def _lines() -> Iterator[tuple[str, Callable[[], Any]]]:
         "derive optimal --agents 3 --step 3 --q 25 --r 100 --p0 100 --format json",
         "derive naive --agents 2 --step 3 --format json", "derive simplified --agents 3 --step 2 --format json",
         "graph --agent 3 --step 4 --format json", "graph --format json --scenario thesis-transient",
-        "reproduce list --format json", "reproduce figure-19 --format json", "reproduce figure-52 --format json",
+        "reproduce --format json", "reproduce figure-19 --format json", "reproduce figure-52 --format json",
         "reproduce figure-26 --format json", "reproduce table-2 --format json", "reproduce figure-33 --format csv",
         "scenario list", "scenario schema", "scenario check fcs-demo",
     ]  # fmt: skip
@@ -317,9 +321,9 @@ def _files() -> Iterator[tuple[str, Callable[[], Any]]]:
 
             out = io.StringIO()
             words = ["stochfuse", "crosscheck", str(path), "thesis-transient", "--method", method, "--format", "json"]
-            with mock.patch.object(sys, "argv", words), redirect_stdout(out), redirect_stderr(io.StringIO()):
-                with suppress(SystemExit):  # its exit status is the verdict
-                    main()
+            quiet = redirect_stderr(io.StringIO())
+            with mock.patch.object(sys, "argv", words), redirect_stdout(out), quiet, suppress(SystemExit):
+                main()  # its exit status is the verdict
             return json.loads(out.getvalue().replace(str(path), "r.csv"))
 
     for method, shift in product(("general", "simplified"), (1.0, 1.3)):
