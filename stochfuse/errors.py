@@ -41,8 +41,8 @@ class UsageError(StochfuseError, ValueError):
     """A request that does not fit the scenario or the method."""
 
 
-class NotABatchError(UsageError):
-    """Scenarios that cannot be evaluated together, or not by this method; one by one they may have answers."""
+class TooManyError(UsageError):
+    """More outcomes than can be listed."""
 
 
 class NoAnswerError(StochfuseError):

@@ -24,10 +24,11 @@ COMMANDS = (
     "reproduce",
     "study",
     "scenario",
+    "methods",
 )
 """Each has a module in `stochfuse.cli`, with a function of the same name, or with an `app` of its own commands."""
 
-WRONG_WORDS = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
+WRONG_WORDS: type[Exception] = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
 """What is raised for words that are no command line; Typer brings its own click, or uses the one that is installed."""
 EXIT_FAILURE, EXIT_USAGE, EXIT_NO_ANSWER, EXIT_INTERRUPTED = 1, 2, 3, 130
 

@@ -52,6 +52,7 @@ class Method(StrEnum):
     simplified = "simplified"
     general = "general"
     optimal = "optimal"
+    chain = "chain"
     naive = "naive"
     monte_carlo = "monte-carlo"
 
@@ -115,7 +116,9 @@ def predict(
     chosen = metric_of(metric or given.metric or "trace", given.model)
     for name in quantities:
         check(name, chosen)
-    way = Method(given.method or "simplified") if method is None else method
+    # an estimator without a method picks the exact engine that takes it, else sampling
+    free = method is None and given.method is None and estimator is not None
+    way = Method(given.method or ("general" if free else "simplified")) if method is None else method
     if statistic != "mean":
         if way not in (Method.general, Method.naive):
             raise UsageError(f"--statistic {statistic}: expected --method general or naive, got {way.value}")
@@ -139,8 +142,9 @@ def predict(
         ),
     }
     with _progress(way) as settings["progress"]:
-        found = run(given, links, way.value, quantities, **settings)
-        at_zero = run(given, [0.0], way.value, quantities, **settings) if normalise else [None] * len(found)
+        asked = None if free else way.value
+        found = run(given, links, asked, quantities, **settings)
+        at_zero = run(given, [0.0], asked, quantities, **settings) if normalise else [None] * len(found)
     views = tuple(
         View(p, chosen, chosen_agent, baseline, digits, statistic) for p, baseline in zip(found, at_zero, strict=True)
     )

@@ -31,7 +31,7 @@ import numpy as np
 
 from stochfuse.engines.events import Event, Outcome, Rows, Weights, concerning, fates, outcomes
 from stochfuse.engines.progress import Progress, uncollected
-from stochfuse.errors import UsageError
+from stochfuse.errors import TooManyError
 from stochfuse.estimators.protocol import AdditiveEstimator, Estimator
 
 MOST_GENERATORS = 6
@@ -124,10 +124,6 @@ class Structure(NamedTuple):
     endings: list[Ending]
     states: list[int]
     outcomes: list[int]
-
-
-class TooManyError(UsageError):
-    """More outcomes than can be listed."""
 
 
 def enumerate_outcomes(estimator: Estimator, request: Request, progress: Progress | None = None) -> Structure:

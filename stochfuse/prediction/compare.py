@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse.engines.enumeration import TooManyError
 from stochfuse.engines.events import events
-from stochfuse.errors import NoAnswerError, UsageError
+from stochfuse.errors import NoAnswerError, TooManyError, UsageError
 from stochfuse.kalman.metrics import Metric
 from stochfuse.prediction.predict import choose, predict
 from stochfuse.prediction.quantities import QUANTITIES

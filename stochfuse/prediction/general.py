@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.engines.distribution import Distribution, parse_statistic
-from stochfuse.engines.enumeration import Claimed, Request, Structure, TooManyError, claims_of, enumerate_outcomes
+from stochfuse.engines.enumeration import Claimed, Request, Structure, claims_of, enumerate_outcomes
 from stochfuse.engines.events import (
     MOST_AGENTS_RELABELLED,
     Rows,
@@ -35,9 +35,9 @@ from stochfuse.engines.events import (
     weights_for,
 )
 from stochfuse.engines.precision import NO_DIGIT, PROMISED, MovedSources, change, moved_claims, notes, reach, suspects
-from stochfuse.errors import NoAnswerError, StochfuseError, UsageError
+from stochfuse.errors import NoAnswerError, StochfuseError, TooManyError, UsageError
 from stochfuse.estimators.ledger import InformationClaims, evaluate
-from stochfuse.estimators.making import SUMS, make, sources
+from stochfuse.estimators.making import make, sources
 from stochfuse.estimators.protocol import Claims, Made
 from stochfuse.estimators.world import claimed_only, moments
 from stochfuse.kalman.kernel import Estimate
@@ -45,6 +45,7 @@ from stochfuse.kalman.metrics import Metric, Moments
 from stochfuse.prediction.method import Averaged, Settings, group_of, joined
 from stochfuse.prediction.quantities import linear, matrix, number, value
 from stochfuse.scenario.network import LinkRows, Network, number_of_senders, restricted, uniform_rows
+from stochfuse.scenario.registry import SUMS
 from stochfuse.scenario.system import Items, Noises, System
 
 MOST_PROBABILITIES = 20_000_000

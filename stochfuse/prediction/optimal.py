@@ -29,18 +29,18 @@ from stochfuse.engines.enclosure import enclosed_optimum
 from stochfuse.engines.events import relabellings
 from stochfuse.engines.precision import PROMISED, Moving, change, notes, reach, suspects
 from stochfuse.errors import UsageError
-from stochfuse.estimators.making import require_independent_noise, require_one_state
 from stochfuse.kalman.metrics import Moments
 from stochfuse.prediction.general import groups_alike
 from stochfuse.prediction.method import Averaged, Settings, group_of
 from stochfuse.prediction.method import joined as joined_items
+from stochfuse.scenario.capabilities import require
 from stochfuse.scenario.model import Model, Sensor
 from stochfuse.scenario.network import LinkRows
+from stochfuse.scenario.registry import CHAIN, OPTIMAL
 from stochfuse.scenario.system import Items, Noises, System
 
 BLOCK = 1 << 19
 """Numbers that covariances, weights or transitions of a block of items take."""
-NAME = "optimal"
 
 
 def averaged(system: System, items: Items, how: Settings, errors: bool) -> Averaged:
@@ -72,7 +72,7 @@ def averaged(system: System, items: Items, how: Settings, errors: bool) -> Avera
         moments=Moments(found.P, found.P, found.bias, found.square) if errors else Moments(found.P),
         group_of=group_of(groups),
         natures=np.where(far > PROMISED, "approximate", "bound" if bound else "exact"),
-        estimator=NAME,
+        estimator=OPTIMAL,
         rounding=far,
         notes=(*said, *notes(float(far.max()))),
         meta={"paths": found.paths if paths is None else paths, "relative_bound": found.bound.tolist()},
@@ -141,8 +141,7 @@ def rounding(given: Filter, found: Chain, go: Callable[[Filter], Chain]) -> np.n
 
 def groups_of(system: System, links: LinkRows) -> tuple[tuple[int, ...], ...]:
     """Return the agents that are alike, whose optimum is the same."""
-    require_one_state(system, "the optimum")
-    require_independent_noise(system, "the optimum")
+    require(system, links, OPTIMAL, CHAIN)
     network, kinds = system.network, system.sensor_of
     if _alike(system, links):
         return (tuple(range(network.agents)),)

@@ -17,11 +17,12 @@ from typing import Any
 import numpy as np
 
 from stochfuse.engines.precision import told
-from stochfuse.errors import StochfuseError, UsageError
+from stochfuse.errors import StochfuseError, TooManyError, UsageError
 from stochfuse.kalman.checks import covariance_fault
 from stochfuse.prediction.method import RUNS, Averaged, Settings, faults_of
 from stochfuse.prediction.quantities import QUANTITIES
 from stochfuse.prediction.result import Prediction
+from stochfuse.scenario import capabilities, registry
 from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.registry import CRITERIA, ESTIMATORS, METHODS
 from stochfuse.scenario.scenario import Scenario, link_rows
@@ -34,14 +35,8 @@ CENTRE = (
     "the links: not to be compared with the optimum of what arrived"
 )
 NO_ERROR = "the scenario has no known initial error (initial.error): the bias is 0, the RMS error that of the noise"
-FILE = {
-    "simplified": "simplified",
-    "general": "general",
-    "naive": "general",
-    "optimal": "optimal",
-    "monte-carlo": "sampled",
-}
-"""Where each method is, imported when it is asked for."""
+HARDNESS = ("claimed", "optimal", "actual", "consistency", "bias", "rms")
+"""The moments of the actual error contain what is claimed; bias and rms have more to note."""
 WORTHLESS = 1e-3
 """Relative rounding beyond which it is no answer."""
 
@@ -89,6 +84,13 @@ def predict(
     NoAnswerError
         If a steady state is asked for and there is none.
     """
+    if (
+        method is None
+        and scenario.method is None
+        and settings.get("estimator") is not None
+        and quantity != registry.OPTIMAL
+    ):
+        return _by_any(scenario, link, quantity, settings)
     method, how = _asked(scenario, method, quantity, settings)
     if steady and method != "simplified":
         raise UsageError(f"steady: expected method simplified, got {method}")
@@ -114,19 +116,20 @@ def predict_several(
     **settings: Any,
 ) -> list[Prediction]:
     """Predict several quantities, with no more work than the hardest of them needs; see `predict`."""
-    method = method or scenario.method or "simplified"
-    apart = [q for q in quantities if q == "optimal" and method != "optimal"]
-    together = [q for q in quantities if q not in apart]
-    if method == "optimal" and {"claimed", "optimal"} <= set(together):
+    method = registry.OPTIMAL if method == registry.CHAIN else method or scenario.method
+    if method is None and settings.get("estimator") is None:
+        method = registry.SIMPLIFIED
+    together, apart = _together(method or "", quantities)
+    if method == registry.OPTIMAL and {"claimed", "optimal"} <= set(together):
         raise UsageError(
             "quantity: with method optimal the claimed covariance is the optimal one; expected one of them"
         )
-    # the moments of the actual error contain what is claimed; bias and rms have more to note
-    hardest = max(together, key=("claimed", "optimal", "actual", "consistency", "bias", "rms").index, default=None)
-    found = {q: predict(scenario, link, method, q, **settings) for q in apart}
-    if hardest is not None:
-        common = predict(scenario, link, method, hardest, **settings)
-        found |= {q: common if q == hardest else common.shown_as(q) for q in together}
+    found = {}
+    for some in (together, apart):
+        if some:
+            hardest = max(some, key=HARDNESS.index)
+            common = predict(scenario, link, method, hardest, **settings)
+            found |= {q: common if q == hardest else common.shown_as(q) for q in some}
     return [found[q] for q in quantities]
 
 
@@ -203,7 +206,8 @@ def predict_items(
         As `predict`, if that would raise it for one item; a NoAnswerError names such items where they are known.
     """
     predictions, faults, natures = {}, {}, []
-    for some, hardest in _together(method or scenario.method or "simplified", quantities):
+    for some in filter(None, _together(method or scenario.method or registry.SIMPLIFIED, quantities)):
+        hardest = max(some, key=HARDNESS.index)
         way, how = _asked(scenario, method, hardest, settings)
         found = _averaged(scenario.system, items, way, how, hardest)
         first = _prediction(scenario, items.links, way, hardest, found)
@@ -266,20 +270,22 @@ def _stack(name: str, given: Any, n: int, *, definite: bool = False) -> np.ndarr
     return M
 
 
-def _together(method: str, quantities: Sequence[str]) -> list[tuple[list[str], str]]:
-    """Quantities that one calculation gives together, and the hardest of each."""
-    apart = [q for q in quantities if q == "optimal" and method != "optimal"]
-    together = [q for q in quantities if q not in apart]
-    # the moments of the actual error contain what is claimed; bias and rms have more to note
-    order = ("claimed", "optimal", "actual", "consistency", "bias", "rms")
-    return [(some, max(some, key=order.index)) for some in (together, apart) if some]
+def _together(method: str, quantities: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Quantities that one calculation gives together, and those that need another."""
+    apart = [q for q in quantities if q == registry.OPTIMAL and method != registry.OPTIMAL]
+    return [q for q in quantities if q not in apart], apart
 
 
 def _asked(scenario: Scenario, method: str | None, quantity: str, settings: Mapping[str, Any]) -> tuple[str, Settings]:
     """Method and settings of a request, checked."""
-    method = method or scenario.method or "simplified"
+    method = method or scenario.method or registry.SIMPLIFIED
     choose("method", method, METHODS)
     choose("quantity", quantity, QUANTITIES)
+    if method == registry.CHAIN:
+        elsewhere = capabilities.not_averaged(settings.get("estimator") or registry.OPTIMAL, method)
+        if elsewhere is not None:
+            raise UsageError(f"method {method}: {elsewhere}")
+        method = registry.OPTIMAL
     unknown = set(settings) - set(Settings.__dataclass_fields__)
     if unknown:
         raise TypeError(f"predict() got an unexpected keyword argument '{sorted(unknown)[0]}'")
@@ -291,9 +297,28 @@ def _asked(scenario: Scenario, method: str | None, quantity: str, settings: Mapp
     return method, replace(how, estimator="naive") if method == "naive" else how
 
 
+def _by_any(scenario: Scenario, link: Any, quantity: str, settings: Mapping[str, Any]) -> Prediction:
+    """Predict an estimator by the exact engine that takes it, else by sampling, and say which."""
+    name = settings["estimator"]
+    choose("estimator", name, ESTIMATORS)
+    features = capabilities.features_of(scenario.system, link_rows(scenario, link))
+    engines = capabilities.engine_for(name, features) or [registry.GENERAL]
+    for engine in engines:
+        try:
+            found = predict(scenario, link, engine, quantity, **settings)
+        except TooManyError:
+            if engine == engines[-1]:
+                raise
+        else:
+            return replace(found, notes=(*found.notes, f"estimator {name} is averaged by --method {engine}"))
+    raise TypeError("some engine was tried")
+
+
 def _averaged(system: System, items: Items, method: str, how: Settings, quantity: str) -> Averaged:
     errors = quantity not in ("claimed", "optimal")
-    found = _room(FILE[method]).averaged(system, items, how, errors)
+    engine = registry.engine_of(method)
+    capabilities.require(system, items.links, capabilities.averaged_by(engine.name) or how.estimator, engine.name)
+    found = _room(engine.file).averaged(system, items, how, errors)
     if method == "simplified" and errors:
         found = _room("states").with_errors(system, items, found)
     first = [NAIVE] if how.estimator == "naive" and method in ("general", "naive") and not errors else []

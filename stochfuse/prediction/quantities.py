@@ -23,8 +23,9 @@ import numpy as np
 
 from stochfuse.errors import UsageError
 from stochfuse.kalman.metrics import Metric, Moments
+from stochfuse.scenario import registry
 
-QUANTITIES = ("claimed", "actual", "optimal", "consistency", "bias", "rms")
+QUANTITIES = registry.QUANTITIES
 OVERCONFIDENT = 1.05
 """Ratio of actual to claimed from which on a reader is warned."""
 
@@ -85,12 +86,7 @@ def linear(quantity: str, metric: Metric) -> bool:
 
 def title(quantity: str, stage: str) -> str:
     """Return the quantity in words: 'claimed posterior covariance'."""
-    return {
-        "actual": f"actual {stage} error covariance",
-        "consistency": f"{stage} consistency, actual / claimed (> 1: overconfident)",
-        "bias": f"{stage} bias from the initial error",
-        "rms": f"root-mean-square {stage} error (noise and bias)",
-    }.get(quantity, f"{quantity} {stage} covariance")
+    return registry.quantity(quantity).title.format(stage=stage)
 
 
 def noun(quantity: str, metric: Metric) -> str:

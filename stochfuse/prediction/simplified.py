@@ -37,7 +37,6 @@ import numpy as np
 from stochfuse.engines.mean_field import Case, Outcomes, run, run_like
 from stochfuse.engines.precision import definite, ill_noise, lost, rounding, told
 from stochfuse.errors import UsageError
-from stochfuse.estimators.making import require_independent_noise, require_one_state
 from stochfuse.kalman.algebra import NUMPY, Algebra, inverse
 from stochfuse.kalman.arrivals import Counts, like_senders, poisson_binomial
 from stochfuse.kalman.averaged_update import noise_factor, sound
@@ -45,11 +44,11 @@ from stochfuse.kalman.checks import first_fault
 from stochfuse.kalman.kernel import Estimate, from_information, to_information, update, update_information
 from stochfuse.kalman.metrics import Moments
 from stochfuse.prediction.method import Averaged, Settings, joined
-from stochfuse.scenario.network import LinkRows, Network, number_of_senders, possible_senders, require_memoryless
+from stochfuse.scenario.capabilities import require
+from stochfuse.scenario.network import LinkRows, number_of_senders, possible_senders
+from stochfuse.scenario.registry import BROADCAST_PRIOR, SIMPLIFIED
 from stochfuse.scenario.system import Items, Noises, System
 
-NAME = "broadcast-prior"
-"""What the agents are taken to do: they share the broadcast prior and nothing else."""
 DOUBTFUL = 1e-10
 """Smallest pivot of R, relative to its variance, below which it takes a library's word that there is a factor."""
 MOST_OUTCOMES = 100_000
@@ -150,7 +149,7 @@ def averaged(system: System, items: Items, how: Settings = Settings(), errors: b
         moments=Moments(found.P),
         group_of=found.group_of,
         natures=np.full(len(items), "approximate"),
-        estimator=NAME,
+        estimator=BROADCAST_PRIOR,
         rounding=reach,
         faults=faults,
         notes=tuple(said),
@@ -169,8 +168,6 @@ def covariances(system: System, items: Items) -> Covariances:
         If messages are delayed, unlike agents make too many outcomes, or agents do not track one state with independent
         noises.
     """
-    require_one_state(system, "method simplified")
-    require_independent_noise(system, "method simplified")
     steps, links = system.steps, len(items)
     parts, forms, all_groups = [], set(), groups(system, items)
     why: dict[int, str] = {}
@@ -277,22 +274,11 @@ def departures(system: System, rows: LinkRows) -> list[str]:
     return notes
 
 
-def require_prompt(network: Network) -> None:
-    """Raise UsageError if messages may be delayed."""
-    if network.delay[0] != 1.0:
-        raise UsageError("method 'simplified' is derived without delay (thesis 4.2); network.delay must be 0")
-
-
 def groups(system: System, items: Items) -> list[Group]:
     """Return the groups of agents that (54) has to be evaluated for."""
     network, rows = system.network, items.links
-    require_prompt(network)
+    require(system, rows, BROADCAST_PRIOR, SIMPLIFIED)
     steps = range(1, network.steps + 1)
-    require_memoryless(
-        rows,
-        "method 'simplified'",
-        "it averages after every step and forgets which links were bad; use general, optimal or monte-carlo",
-    )
     shared = system.shared
     if _one_case(system, rows):
         return [Group((tuple(range(network.agents)),), like_case(system, rows, items.noises))]

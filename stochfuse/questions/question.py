@@ -18,7 +18,7 @@ from stochfuse.prediction.predict import choose
 from stochfuse.prediction.predict import predict as predict_
 from stochfuse.prediction.quantities import noun
 from stochfuse.prediction.result import Prediction
-from stochfuse.scenario.registry import METHODS
+from stochfuse.scenario.registry import CHAIN, METHODS, OPTIMAL
 from stochfuse.scenario.scenario import Scenario
 
 SLACK = 8 * np.finfo(float).eps
@@ -108,6 +108,7 @@ def question(
     """
     choose("method", method, METHODS)
     last = scenario.network.steps
+    method = OPTIMAL if method == CHAIN else method
     if method == "monte-carlo":
         raise UsageError(
             "method: expected simplified, general, optimal or naive, got monte-carlo: its values are sampled, and what "

@@ -22,30 +22,9 @@ from stochfuse.prediction.quantities import unit as unit_of
 from stochfuse.prediction.result import Prediction
 from stochfuse.report.plot import MARKERS, figure_class, spread
 from stochfuse.report.table import Table, number, to_csv, to_text, write_file
+from stochfuse.scenario.registry import title as method_title
 
 SCHEMA = "stochfuse.prediction/1"
-METHOD_TITLES = {
-    "simplified": "simplified formulation (54)",
-    "general": "general formulation (49)",
-    "naive": "general formulation (49)",
-    "optimal": "contact chain",
-    "monte-carlo": "Monte Carlo",
-}
-ESTIMATOR_TITLES = {
-    "broadcast-prior": "",
-    "optimal": ": the best that linear fusion can do with what arrived",
-    "local-fusion-graph": " of the Local Fusion Graph",
-    "naive": " of naive fusion (42)/(43)",
-    "covariance-intersection": " of covariance intersection",
-    "split-ci": " of split covariance intersection",
-    "blender": " of a tree of blenders",
-    "joint-blender": " of the joint blender",
-    "equivalent-measurement": " of the equivalent measurement",
-    "independent-measurements": " of measurements taken for independent",
-    "lwin": " of LWIN",
-    "itns": " of ITNS",
-    "stand-alone": " without fusion",
-}
 STATISTICS = {
     "variance": "variance over the outcomes of the {what}",
     "std": "standard deviation over the outcomes of the {what}",
@@ -193,7 +172,7 @@ class View:
     def how(self) -> str:
         """One line: the method and how exact it is."""
         p = self.prediction
-        return f"{METHOD_TITLES[p.method]}{ESTIMATOR_TITLES[p.estimator]}; {self.nature}"
+        return f"{method_title(p.method, p.estimator)}; {self.nature}"
 
     @property
     def nature(self) -> str:

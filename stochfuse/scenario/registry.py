@@ -1,20 +1,292 @@
-"""The names by which users ask for methods, estimators and criteria."""
+"""What can be asked of a scenario: every estimator, engine, quantity, metric and statistic, declared once.
 
-METHODS = ("simplified", "general", "optimal", "naive", "monte-carlo")
-ESTIMATORS = (
-    "local-fusion-graph",
-    "naive",
-    "optimal",
-    "covariance-intersection",
-    "split-ci",
-    "blender",
-    "joint-blender",
-    "equivalent-measurement",
-    "independent-measurements",
-    "lwin",
-    "itns",
-    "stand-alone",
+What the agents do (`Estimator`) and how chance is averaged (`Engine`) are two choices;
+`stochfuse.scenario.capabilities` says which pair takes what.  Choices and help of the command line, titles, error
+messages and `stochfuse methods` are made from these entries.  It lies in this room because a scenario file's [report]
+names what is declared here.  To add an estimator: one entry here, its file in `stochfuse.estimators`, its row in the
+tests' matrix.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+LFG, NAIVE, OPTIMAL, STAND_ALONE = "local-fusion-graph", "naive", "optimal", "stand-alone"
+SIMPLIFIED, GENERAL, CHAIN, MONTE_CARLO = "simplified", "general", "chain", "monte-carlo"
+BROADCAST_PRIOR = "broadcast-prior"
+"""What the simplified formulation takes the agents to do: they share the broadcast prior and nothing else."""
+
+
+class Estimator(NamedTuple):
+    """What the agents do with what arrives.
+
+    Parameters
+    ----------
+    name : as users type it.
+    title : what it is, for a list.
+    source : equation or work that it is from.
+    of : how a title ends that says whose estimates are shown.
+    place : file in `stochfuse.estimators`, and class.
+    sums : whether its estimates are sums of information, so that what is common can be told before any number; the
+        others write down pasts.
+    weighs : whether its weights minimise a criterion.
+    own_states, own_filters : whether agents may have states, or filters of a common state, of their own.
+    footprints : whether it carries its error along as coefficients on all noises.
+    """
+
+    name: str
+    title: str
+    source: str
+    of: str
+    place: tuple[str, str]
+    sums: bool = False
+    weighs: bool = False
+    own_states: bool = False
+    own_filters: bool = False
+    footprints: bool = True
+
+
+class Engine(NamedTuple):
+    """How chance is averaged.
+
+    Parameters
+    ----------
+    name : as users type it after --method.
+    title, source : what it is, and the equations or the work that it is from.
+    nature : what its numbers are.
+    help : one line.
+    file : in `stochfuse.prediction`.
+    """
+
+    name: str
+    title: str
+    source: str
+    nature: str
+    help: str
+    file: str
+
+
+class Short(NamedTuple):
+    """A short form of --method: an estimator with an engine."""
+
+    name: str
+    estimator: str
+    engine: str
+
+
+class Quantity(NamedTuple):
+    """What is shown of an estimate's error.
+
+    Parameters
+    ----------
+    name, title, help : as users type it, and in words.
+    error : whether the estimate's true error has to be followed.
+    """
+
+    name: str
+    title: str
+    help: str
+    error: bool
+
+
+class Measure(NamedTuple):
+    """A metric (one number out of a covariance), or a statistic of it over the outcomes, as users type it."""
+
+    name: str
+    help: str
+
+
+ESTIMATOR = (
+    Estimator(
+        LFG,
+        "common information removed by the Local Fusion Graph",
+        "thesis, chapter 2 and appendix A",
+        " of the Local Fusion Graph",
+        ("local_fusion_graph", "LocalFusionGraph"),
+        sums=True,
+    ),
+    Estimator(
+        NAIVE,
+        "estimates added up, nothing removed",
+        "thesis, (42)/(43)",
+        " of naive fusion (42)/(43)",
+        ("naive", "NaiveFusion"),
+        sums=True,
+    ),
+    Estimator(
+        OPTIMAL,
+        "the best that any linear fusion could do with what arrived",
+        "one filter over every measurement in the pedigree",
+        ": the best that linear fusion can do with what arrived",
+        ("optimal", "OptimalFusion"),
+        sums=True,
+    ),
+    Estimator(
+        "covariance-intersection",
+        "everything taken for possibly correlated",
+        "Julier and Uhlmann 1997",
+        " of covariance intersection",
+        ("intersection", "CovarianceIntersection"),
+        weighs=True,
+        own_states=True,
+    ),
+    Estimator(
+        "split-ci",
+        "everything but the step's own measurement taken for possibly correlated",
+        "patent on split covariance intersection",
+        " of split covariance intersection",
+        ("intersection", "SplitCovarianceIntersection"),
+        weighs=True,
+        own_states=True,
+    ),
+    Estimator(
+        "blender",
+        "parallel filters blended in a tree, two at a time",
+        "parallel filters, (19)–(30)",
+        " of a tree of blenders",
+        ("blender", "Blender"),
+        own_filters=True,
+    ),
+    Estimator(
+        "joint-blender",
+        "parallel filters blended all at once",
+        "parallel filters, least trace of all",
+        " of the joint blender",
+        ("blender", "JointBlender"),
+        own_filters=True,
+    ),
+    Estimator(
+        "equivalent-measurement",
+        "measurements exchanged, their noises correlated and uncertain",
+        "extended Kalman filter with uncertain fusion",
+        " of the equivalent measurement",
+        ("equivalent", "EquivalentMeasurement"),
+        footprints=False,
+    ),
+    Estimator(
+        "independent-measurements",
+        "measurements exchanged and taken for independent",
+        "the same with R taken for block diagonal",
+        " of measurements taken for independent",
+        ("equivalent", "IndependentMeasurements"),
+        footprints=False,
+    ),
+    Estimator(
+        "lwin",
+        "cooperative measurements, each node for itself",
+        "patent on cooperative estimators",
+        " of LWIN",
+        ("cooperative", "Lwin"),
+        own_states=True,
+    ),
+    Estimator(
+        "itns",
+        "cooperative measurements, one total covariance",
+        "patent on cooperative estimators, (27)",
+        " of ITNS",
+        ("cooperative", "Itns"),
+        own_states=True,
+        footprints=False,
+    ),
+    Estimator(
+        STAND_ALONE,
+        "no fusion: every agent's own filter",
+        "thesis, (23)–(27)",
+        " without fusion",
+        ("stand_alone", "StandAlone"),
+        own_states=True,
+    ),
 )
-INTERSECTIONS = ("covariance-intersection", "split-ci")
-"""Estimators whose weights minimise one of the criteria."""
+ENGINE = (
+    Engine(
+        SIMPLIFIED,
+        "simplified formulation (54)",
+        "thesis, (50)–(54)",
+        "approximate (mean field)",
+        "average after every step, then go on from the average; of the broadcast prior alone",
+        "simplified",
+    ),
+    Engine(
+        GENERAL,
+        "general formulation (49)",
+        "thesis, (44)–(49)",
+        "exact",
+        "go through every outcome of which messages arrive",
+        "general",
+    ),
+    Engine(
+        CHAIN,
+        "contact chain",
+        "whose measurements an agent holds, walked backwards",
+        "exact, or bounds",
+        "follow how many agents' measurements are held; of the optimum alone",
+        "optimal",
+    ),
+    Engine(
+        MONTE_CARLO,
+        "Monte Carlo",
+        "sampled outcomes",
+        "sampled",
+        "draw which messages arrive, --runs times for each link probability",
+        "sampled",
+    ),
+)
+SHORT = (Short(NAIVE, NAIVE, GENERAL), Short(OPTIMAL, OPTIMAL, CHAIN))
+QUANTITY = (
+    Quantity("claimed", "claimed {stage} covariance", "what the fusion rule itself reports", False),
+    Quantity("actual", "actual {stage} error covariance", "what its error truly has", True),
+    Quantity(
+        "optimal", "optimal {stage} covariance", "the best that any linear fusion could do with what arrived", False
+    ),
+    Quantity("consistency", "{stage} consistency, actual / claimed (> 1: overconfident)", "actual / claimed", True),
+    Quantity("bias", "{stage} bias from the initial error", "what is left of a known initial error", True),
+    Quantity("rms", "root-mean-square {stage} error (noise and bias)", "root of the mean squared error", True),
+)
+METRIC = (
+    Measure("trace", "sum of all variances"),
+    Measure("det", "determinant"),
+    Measure("max-eig", "largest eigenvalue"),
+    Measure("var:STATE", "variance of a state"),
+    Measure("std:STATE", "its root"),
+    Measure("rms:STATE,STATE,…", "root of the summed variances of some states"),
+)
+STATISTIC = (
+    Measure("mean", "expectation"),
+    Measure("variance", "variance over the outcomes"),
+    Measure("std", "standard deviation over the outcomes"),
+    Measure("quantile:P", "what is not exceeded with probability P"),
+    Measure("at-most:LIMIT", "probability that it is at most the limit"),
+    Measure("derivative", "derivative of the expectation in µ"),
+)
 CRITERIA = ("det", "trace", "max-eig")
+"""What the weights of an intersection minimise."""
+
+ESTIMATORS = tuple(e.name for e in ESTIMATOR)
+ENGINES = tuple(e.name for e in ENGINE)
+METHODS = (SIMPLIFIED, GENERAL, CHAIN, OPTIMAL, NAIVE, MONTE_CARLO)
+"""What --method takes: the engines, and the short forms."""
+QUANTITIES = tuple(q.name for q in QUANTITY)
+INTERSECTIONS = tuple(e.name for e in ESTIMATOR if e.weighs)
+SUMS = tuple(e.name for e in ESTIMATOR if e.sums)
+
+
+def estimator(name: str) -> Estimator:
+    """Return the entry of an estimator."""
+    return next(e for e in ESTIMATOR if e.name == name)
+
+
+def engine_of(method: str) -> Engine:
+    """Return the engine behind what --method takes."""
+    name = next((s.engine for s in SHORT if s.name == method), method)
+    return next(e for e in ENGINE if e.name == name)
+
+
+def quantity(name: str) -> Quantity:
+    """Return the entry of a quantity."""
+    return next(q for q in QUANTITY if q.name == name)
+
+
+def title(method: str, estimator_name: str) -> str:
+    """Return method and estimator in words: 'general formulation (49) of the Local Fusion Graph'."""
+    whose = "" if estimator_name == BROADCAST_PRIOR else estimator(estimator_name).of
+    return engine_of(method).title + whose

@@ -13,9 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.engines.enumeration import TooManyError
 from stochfuse.engines.precision import told
-from stochfuse.errors import NoAnswerError, ScenarioError, StochfuseError
+from stochfuse.errors import NoAnswerError, ScenarioError, StochfuseError, TooManyError
 from stochfuse.kalman.checks import LARGEST, covariance_fault, first_fault
 from stochfuse.prediction.predict import WORTHLESS, predict_items, predict_several
 from stochfuse.prediction.result import Prediction

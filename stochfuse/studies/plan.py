@@ -18,14 +18,13 @@ import numpy as np
 from pydantic import ConfigDict, Field, Strict
 
 from stochfuse.errors import Problem, ScenarioError
-from stochfuse.estimators.making import SUMS
 from stochfuse.kalman.checks import LARGEST, shown
 from stochfuse.kalman.metrics import Metric
 from stochfuse.kalman.metrics import metric as metric_of
 from stochfuse.prediction.quantities import noun
 from stochfuse.prediction.quantities import unit as unit_of
 from stochfuse.scenario.checker import Checker
-from stochfuse.scenario.registry import CRITERIA, ESTIMATORS, METHODS
+from stochfuse.scenario.registry import CRITERIA, ESTIMATORS, METHODS, SUMS
 from stochfuse.scenario.scenario import Scenario
 from stochfuse.scenario.schema import Number, Table, problems_of
 

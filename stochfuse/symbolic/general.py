@@ -20,11 +20,11 @@ import numpy as np
 import sympy
 from sympy.polys.fields import field
 
-from stochfuse.engines.enumeration import Request, TooManyError, enumerate_outcomes
+from stochfuse.engines.enumeration import Request, enumerate_outcomes
 from stochfuse.engines.events import Counts, events, orbits, relabellings
-from stochfuse.errors import UsageError
+from stochfuse.errors import TooManyError, UsageError
 from stochfuse.estimators.ledger import Information, Ledger, Sources, evaluate_exactly
-from stochfuse.estimators.making import SUMS
+from stochfuse.estimators.making import rule_of
 from stochfuse.kalman.algebra import FIELD
 from stochfuse.prediction.general import check_size
 from stochfuse.scenario.model import Model, Sensor
@@ -132,7 +132,7 @@ class GeneralForm:
         drawn = events(network, rows, 1)
         weights = Counts(self.step * len(drawn) + 1)
         ledger = Ledger()
-        estimator = SUMS[self.estimator](ledger, labels, shared=self.shared, relabellings=permutations)
+        estimator = rule_of(self.estimator)(ledger, labels, shared=self.shared, relabellings=permutations)
         groups = tuple(orbits(self.agents, permutations))
         request = Request(self.agents, self.step, (1.0,), lambda _: drawn, weights, groups, most=20_000)
         try:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import stochfuse as sf
-from stochfuse.estimators.making import PASTS
+from stochfuse.scenario.registry import ESTIMATOR
 from stochfuse.scenario.scenario import link_rows
 from tests.agreement import test_matrix
 from tests.oracles import strategies, textbook, textbook_estimators
@@ -433,7 +433,7 @@ def refused(source, message, estimator="stand-alone", **more):
         sf.predict(sf.Scenario.from_mapping(source), [0.5], "general", estimator=estimator, **more)
 
 
-@pytest.mark.parametrize("estimator", [name for name in PASTS if name not in INTERSECTIONS])
+@pytest.mark.parametrize("estimator", [e.name for e in ESTIMATOR if not e.sums and e.name not in INTERSECTIONS])
 def test_late_messages_are_refused(estimator):
     source = COMMON | {"network": COMMON["network"] | {"delay": [0.5, 0.5]}}
     refused(source, f"^estimator {estimator}: expected messages without delay, got network.delay", estimator)

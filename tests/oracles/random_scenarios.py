@@ -8,12 +8,19 @@ from typing import Any
 
 import numpy as np
 
+import stochfuse as sf
+
+# fcs-demo has ten agents, too many for a walk in seconds
+PRESETS = ("beacon-map", "cooperative-pnt", "cv-2d", "gps-ins", "parallel-filters")
 ESTIMATORS_OF_REPORT = ("local-fusion-graph", "naive", "covariance-intersection", "stand-alone")
 
 
 def scenario(rng: np.random.Generator) -> dict[str, Any]:
     """Return the mapping of a random scenario; nearly always one that can be read."""
-    kind = rng.choice(["one state", "filters", "own states"], p=[0.74, 0.13, 0.13])
+    kind = rng.choice(["one state", "filters", "own states", "preset"], p=[0.71, 0.13, 0.13, 0.03])
+    if kind == "preset":
+        made = sf.load_scenario(str(rng.choice(PRESETS))).to_mapping()
+        return made | {"network": made["network"] | {"steps": int(rng.choice([1, 2, 3]))}}
     n, steps = int(rng.choice([1, 2, 3, 4], p=[0.1, 0.45, 0.35, 0.1])), int(rng.choice([1, 2, 3, 4]))
     if kind == "own states":
         return _own(rng, n, steps)
@@ -45,7 +52,7 @@ def _matrix(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:
 
 def covariance(rng: np.random.Generator, d: int, *, definite: bool = False) -> list[list[float]]:
     """A covariance of one-digit numbers; unless it must be definite it is sometimes singular, sometimes 0."""
-    rank = d if definite or _maybe(rng, 0.7) else int(rng.integers(0, d))
+    rank = d if definite or _maybe(rng, 0.85) else int(rng.integers(0, d))
     A = _matrix(rng, d, rank)
     C = A @ A.T + (0.5 * np.eye(d) if rank == d else 0)
     scale = rng.choice([1.0, 100.0, 0.01, 1e6], p=[0.8, 0.1, 0.07, 0.03])

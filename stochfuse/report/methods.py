@@ -1,0 +1,75 @@
+"""What there is to ask for, and what takes what, as tables and JSON: the registry and the capability table, shown."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from stochfuse import __version__
+from stochfuse.report.table import Table, to_csv
+from stochfuse.scenario import capabilities, registry
+
+SCHEMA = "stochfuse.methods/1"
+
+
+def methods_table(*, matrix: bool = False) -> Table:
+    """Return everything that can be asked for by its name; or, for each estimator and engine, what is not taken."""
+    return _matrix_table() if matrix else _listing_table()
+
+
+def _listing_table() -> Table:
+    rows = [("estimator", e.name, f"{e.title} ({e.source})") for e in registry.ESTIMATOR]
+    rows += [("method", e.name, f"{e.title}, {e.source}: {e.help}; {e.nature}") for e in registry.ENGINE]
+    rows += [("method", s.name, f"short for --estimator {s.estimator} --method {s.engine}") for s in registry.SHORT]
+    rows += [("quantity", q.name, q.help) for q in registry.QUANTITY]
+    rows += [("metric", m.name, m.help) for m in registry.METRIC]
+    rows += [("statistic", s.name, s.help) for s in registry.STATISTIC]
+    weighs = "minimised by the weights of " + ", ".join(registry.INTERSECTIONS)
+    rows += [("criterion", c, weighs) for c in registry.CRITERIA]
+    title = ("What can be asked for: --estimator is what the agents do, --method how chance is averaged",)
+    return Table(title, ("option", "name", "what it is"), (), tuple(rows))
+
+
+def _matrix_table() -> Table:
+    rows = []
+    for estimator, engine in capabilities.pairs():
+        why = {f.name: capabilities.reason(estimator, engine, f.name) for f in capabilities.FEATURES}
+        rows.append((estimator, engine, ", ".join(name for name, reason in why.items() if reason) or "takes all"))
+    title = (
+        "Features of a scenario that an estimator averaged by an engine does not take",
+        "known features: " + ", ".join(f.name for f in capabilities.FEATURES),
+        "reasons: --format json",
+    )
+    return Table(title, ("estimator", "method", "does not take"), (), tuple(rows))
+
+
+def methods_csv(*, matrix: bool = False) -> str:
+    """Return the same as CSV: of the matrix every cell, with the reason where it says no."""
+    if not matrix:
+        table = methods_table()
+        return to_csv(table.headings, table.rows)
+    cells = [
+        (estimator, engine, feature, "" if reason is True else reason)
+        for estimator, engines in capabilities.matrix().items()
+        for engine, features in engines.items()
+        for feature, reason in features.items()
+    ]
+    return to_csv(("estimator", "method", "feature", "reason"), cells)
+
+
+def methods_json() -> dict[str, Any]:
+    """Return registry and table with the keys of the schema."""
+    return {
+        "schema": SCHEMA,
+        "version": __version__,
+        "estimators": [{"name": e.name, "title": e.title, "source": e.source} for e in registry.ESTIMATOR],
+        "engines": [
+            {"name": e.name, "title": e.title, "source": e.source, "nature": e.nature, "help": e.help}
+            for e in registry.ENGINE
+        ],
+        "short_forms": [{"name": s.name, "estimator": s.estimator, "engine": s.engine} for s in registry.SHORT],
+        "quantities": [{"name": q.name, "help": q.help} for q in registry.QUANTITY],
+        "metrics": [{"name": m.name, "help": m.help} for m in registry.METRIC],
+        "statistics": [{"name": s.name, "help": s.help} for s in registry.STATISTIC],
+        "features": [{"name": f.name, "key": f.key} for f in capabilities.FEATURES],
+        "matrix": capabilities.matrix(),
+    }
