@@ -105,7 +105,7 @@ def test_bursty_links(tmp_path):
     assert out["values"][0][0] == pytest.approx(out["values"][1][0])  # one step alone knows no bursts
     assert out["values"][0][2] > out["values"][1][2]
     error = run("predict", str(path), code=2).stderr
-    assert "method 'simplified' does not take bursty links (network.burst): it averages after every step" in error
+    assert "method simplified: it does not take bursty links (network.burst): it averages after every step" in error
     error = run("messages", str(path), code=2).stderr
     assert "message load does not take bursty links (network.burst)" in error
     assert run("predict", str(path), "--link", "0.5").returncode == 0  # an option overrides the file

@@ -290,7 +290,7 @@ def test_what_the_chain_does_not_take():
         sf.predict(sf.load_scenario(agents=50, steps=10), [0.5], method="optimal", quantity="bias")
     source = strategies.mapping(1, 25, 1, 100, 100, 2, 2, burst=BURST)
     with pytest.raises(
-        sf.UsageError, match=r"method 'simplified' does not take bursty links \(network.burst\): it averages"
+        sf.UsageError, match=r"method simplified: it does not take bursty links \(network.burst\): it averages"
     ):
         sf.predict(sf.Scenario.from_mapping(source))
     source = strategies.mapping(1, 25, 1, 100, 100, 4, 2, burst=BURST)

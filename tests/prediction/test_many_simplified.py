@@ -308,7 +308,7 @@ def test_unlike_agents_and_masks_are_items_too(source):
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        (network(delay=[0.5, 0.5]), r"method 'simplified' is derived without delay \(thesis 4.2\)"),
+        (network(delay=[0.5, 0.5]), r"method simplified: it is derived without delay \(thesis 4.2\)"),
         (network() | {"noise": {"correlation": 0.5}}, "expected independent measurement noises"),
     ],
 )
