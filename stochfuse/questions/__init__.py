@@ -1,1 +1,10 @@
-"""questions"""
+"""Questions asked of predictions: backwards, of links, of messages, of a simulator.
+
+    least_link, agents_needed      which µ, or how many agents, meet a target
+    sensitivity                    what a better link is worth
+    messages, message_chain        how much the agents have to send each other
+    crosscheck, results            whether a simulator is right
+
+`question` is what several of them have in common.  It knows predictions, and nothing of how they are shown.  A new
+question is one file with one function, and a sheet in `stochfuse.report.solutions`.
+"""

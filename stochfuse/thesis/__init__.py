@@ -1,4 +1,10 @@
-"""What the thesis found, found here: every figure and table of its chapters 3 and 4, and the run time it measured."""
+"""What the thesis found, found here: every figure and table of its chapters 3 and 4, and the run time it measured.
+
+Doors: `catalogue.catalogue` and `find` (every item), `sheet` and `page` (its panels with the statements).  `bench`
+has the numbers, each calculated once, `figures` and `tables` the families of items, `about_…` the thesis'
+statements and how our numbers judge them.  It knows the reports that show it.  A new statement is one entry in the
+`about_` file of its chapter.
+"""
 
 from stochfuse.thesis.bench import Bench as Bench
 from stochfuse.thesis.catalogue import catalogue as catalogue

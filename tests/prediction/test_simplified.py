@@ -242,9 +242,7 @@ def test_one_agent_alone_with_a_matrix_of_links():
 
 def test_delay_is_refused_with_the_reason():
     source = mapping(1.0, 1.0, 1.0, 1.0, 1.0, delay=[0.5, 0.5])
-    with pytest.raises(
-        sf.UsageError, match=r"method simplified: it is derived without delay \(thesis 4.2\)"
-    ):
+    with pytest.raises(sf.UsageError, match=r"method simplified: it is derived without delay \(thesis 4.2\)"):
         sf.predict(sf.Scenario.from_mapping(source))
 
 
