@@ -11,6 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 from stochfuse import __version__
+from stochfuse.cli.progress import shown
 from stochfuse.errors import NoAnswerError, ScenarioError, StochfuseError, UsageError
 
 COMMANDS = (
@@ -61,7 +62,8 @@ class Group(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         """Run the chosen command."""
         try:
-            result = super().invoke(ctx)
+            with shown():
+                result = super().invoke(ctx)
             sys.stdout.flush()
             return result
         except NoAnswerError as error:

@@ -32,6 +32,8 @@ from stochfuse.cli.options import (
     StepsOption,
     WorkersOption,
     check_files,
+    check_memory,
+    chosen_format,
     load,
     quantity_names,
     settings_for,
@@ -110,6 +112,7 @@ def compare(
 
     check_files(output, plot, scenario)
     given, links = load(scenario, agents, steps, architecture, q, r, p0, link)
+    check_memory(given, links, chosen_format(format, output))
     names = None if estimator is None else _names(estimator)
     if names is None and methods is None and given.estimator is not None:
         names = ["all"]  # a scenario for other estimators than those of the thesis' methods
@@ -179,13 +182,11 @@ def _methods(
     relative: bool,
     settings: dict[str, Any],
 ) -> None:
-    from stochfuse.cli.progress import shown
     from stochfuse.prediction.compare import compare as run
     from stochfuse.report import comparisons
     from stochfuse.report.predictions import View
 
-    with shown() as progress:
-        found = run(scenario, links, methods, reference, quantity, progress=progress, **settings)
+    found = run(scenario, links, methods, reference, quantity, **settings)
     view = comparisons.ComparisonView(
         found, tuple(View(p, how.metric, how.agent, None, how.digits) for p in found.predictions), relative
     )
@@ -214,15 +215,13 @@ def _estimators(
     all_steps: bool,
     settings: dict[str, Any],
 ) -> None:
-    from stochfuse.cli.progress import shown
     from stochfuse.prediction.compare import compare_estimators as run
     from stochfuse.prediction.quantities import check
     from stochfuse.report import comparisons as estimators
 
     for name in quantities:
         check(name, how.metric)
-    with shown() as progress:
-        found = run(scenario, links, names, method, quantities=quantities, progress=progress, **settings)
+    found = run(scenario, links, names, method, quantities=quantities, **settings)
     view = estimators.EstimatorView(found, how.metric, how.agent, how.digits, quantities, all_steps)
     for reason in found.left_out:
         typer.echo(f"note: left out: {reason}", err=True)

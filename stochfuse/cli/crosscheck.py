@@ -158,8 +158,6 @@ def _rows(results: Results, scenario: Scenario) -> LinkRows:
 
 
 def _predict(scenario: Scenario, rows: LinkRows, method: Against, settings: dict[str, Any]):
-    from stochfuse.cli.progress import shown
     from stochfuse.prediction.predict import predict
 
-    with shown() as progress:
-        return predict(scenario, rows, method.value, progress=progress, **settings)
+    return predict(scenario, rows, method.value, **settings)

@@ -27,6 +27,8 @@ from stochfuse.cli.options import (
     SeedOption,
     StepsOption,
     check_files,
+    check_memory,
+    chosen_format,
     load,
     settings_for,
     write_report,
@@ -120,6 +122,7 @@ def messages(
     averaging = ["general", "naive"] if method is Method.exact else [method.value]
     graphs = settings_for(averaging, max_graphs=max_graphs, prune=prune)
     given, links = load(scenario, agents, steps, architecture, q, r, p0, link)
+    check_memory(given, links, chosen_format(format, output))
     first, last = _window(given.network.steps, from_step, step)
     whose = int(agent) if agent.isdigit() else agent
     wanted = [each for each in RULES if rule.value in (each, "both")]

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from stochfuse.cli.progress import quiet
 
 if TYPE_CHECKING:
     from stochfuse.report.table import Table
@@ -259,6 +262,26 @@ def quantity_names(text: str) -> list[str]:
     return names
 
 
+BYTES = {"table": 1000, "markdown": 1000, "latex": 1000, "csv": 200, "json": 200}
+"""Memory that a number takes on its way to the reader."""
+
+
+def check_memory(scenario: Scenario, links: Sequence[float] | None, kind: str) -> None:
+    """Raise UsageError, with an estimate, if the answer cannot be held in this machine's memory."""
+    from stochfuse.errors import UsageError
+    from stochfuse.scenario.scenario import link_rows
+
+    steps, rows = scenario.network.steps, len(link_rows(scenario, links).link)
+    needed = rows * steps * (BYTES[kind] + 24 * scenario.model.dimension**2)
+    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed > there:
+        more = "" if BYTES[kind] < BYTES["table"] else ", or --format csv"
+        raise UsageError(
+            f"--steps: {steps:,} steps of {rows:,} link probabilities take about {needed / 1e9:,.0f} GB of memory, and "
+            f"this machine has {there / 1e9:,.0f}; expected fewer of them{more}"
+        )
+
+
 def check_files(output: Path | None, plot: Path | None, *inputs: str) -> None:
     """Raise UsageError early if a file can never be written, if two are one, or if one is an input."""
     from stochfuse.errors import UsageError
@@ -331,6 +354,7 @@ def write_report(
         text = to_json(json())
     else:
         text = render(table(), kind, terminal_width())
+    quiet()
     write_text(text, output)
 
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -35,6 +34,8 @@ from stochfuse.cli.options import (
     StepsOption,
     WorkersOption,
     check_files,
+    check_memory,
+    chosen_format,
     load,
     quantity_names,
     settings_for,
@@ -112,6 +113,7 @@ def predict(
     check_files(output, plot, scenario)
     quantities = quantity_names(quantity)
     given, links = load(scenario, agents, steps, architecture, q, r, p0, link)
+    check_memory(given, links, chosen_format(format, output))
     chosen_agent = whose(agent, given)
     chosen = metric_of(metric or given.metric or "trace", given.model)
     for name in quantities:
@@ -141,10 +143,9 @@ def predict(
             criterion=criterion,
         ),
     }
-    with _progress(way) as settings["progress"]:
-        asked = None if free else way.value
-        found = run(given, links, asked, quantities, **settings)
-        at_zero = run(given, [0.0], asked, quantities, **settings) if normalise else [None] * len(found)
+    asked = None if free else way.value
+    found = run(given, links, asked, quantities, **settings)
+    at_zero = run(given, [0.0], asked, quantities, **settings) if normalise else [None] * len(found)
     views = tuple(
         View(p, chosen, chosen_agent, baseline, digits, statistic) for p, baseline in zip(found, at_zero, strict=True)
     )
@@ -185,14 +186,6 @@ def _report_several(views: tuple[View, ...], format: Format | None, output: Path
         partial(side_by_side.side_csv, views),
         partial(side_by_side.side_json, views),
     )
-
-
-def _progress(method: Method) -> AbstractContextManager[Any]:
-    if method is Method.simplified:
-        return nullcontext()
-    from stochfuse.cli.progress import shown
-
-    return shown()
 
 
 def _warn(views: tuple[View, ...]) -> None:

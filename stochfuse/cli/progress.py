@@ -1,23 +1,36 @@
-"""Long work says on standard error what it is about to do and how far it is."""
+"""Signs of life on standard error: what long work is about to do, and how far it is.
+
+The door of the command line listens to every command (`shown`).  Work that takes longer than `PATIENCE` gets a bar in a
+terminal, and elsewhere a line now and then, whichever engine does it; what is quick says nothing.
+"""
 
 from __future__ import annotations
 
 import sys
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import typer
 
-from stochfuse.engines.progress import Progress
+from stochfuse.engines.progress import Progress, listening
+
+PATIENCE = 2.0
+"""Seconds of work after which the user is told of it."""
+LINES = (2.0, 10.0, 30.0)
+"""Seconds after which a line is written where there is no terminal; from then on every minute."""
 
 
 class Shown(Progress):
-    """Notes and, in a terminal, a bar."""
+    """A thread that shows what the work last said."""
 
     def __init__(self) -> None:
-        self._bar = None
-        self._task = None
-        self._step: int | None = None
+        self._last = ("working", 0, 0)
+        self._over = threading.Event()
+        self._start = time.monotonic()
+        self._thread = threading.Thread(target=self._bar if _terminal() else self._lines, daemon=True)
+        self._thread.start()
 
     def expect(self, outcomes: int, graphs: int) -> None:
         """Say how much work there is."""
@@ -26,35 +39,61 @@ class Shown(Progress):
         work = f"{counted(outcomes, 'outcome')}; about {counted(graphs, 'different graph')} to carry"
         typer.echo(f"note: {work}", err=True)
 
-    def advance(self, step: int, done: int, total: int) -> None:
-        """Move the bar."""
-        if not sys.stderr.isatty() or (self._bar is None and total < 100 and step):
-            return
-        if self._bar is None:
-            from rich.console import Console
-            from rich.progress import Progress as Bar
-
-            self._bar = Bar(console=Console(stderr=True), transient=True)
-            self._bar.start()
-        if self._step != step or self._task is None:
-            if self._task is not None:
-                self._bar.remove_task(self._task)
-            self._step, self._task = step, self._bar.add_task(f"step {step}" if step else "sampling", total=total)
-        if done % 16 == 0 or done == total or not step:
-            self._bar.update(self._task, completed=done)
+    def advance(self, what: str, done: int, total: int) -> None:
+        """Keep what was said last."""
+        self._last = (what, done, total)
 
     def stop(self) -> None:
-        """Take the bar away."""
-        if self._bar is not None:
-            self._bar.stop()
-            self._bar = self._task = None
+        """Take the bar away, and say no more."""
+        self._over.set()
+        if self._thread is not threading.current_thread():
+            self._thread.join()
+
+    def _bar(self) -> None:
+        if self._over.wait(PATIENCE):
+            return
+        from rich.console import Console
+        from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import Progress as Bar
+
+        columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+        with Bar(*columns, console=Console(stderr=True), transient=True, redirect_stdout=False) as bar:
+            task = bar.add_task("working", total=None)
+            while not self._over.wait(0.2):
+                what, done, total = self._last
+                bar.update(task, description=what, completed=done, total=total or None)
+
+    def _lines(self) -> None:
+        said = 0
+        while True:
+            due = LINES[said] if said < len(LINES) else 60.0 * (said - len(LINES) + 1)
+            if self._over.wait(max(0.0, self._start + due - time.monotonic())):
+                return
+            what, done, total = self._last
+            share = f", {done:,} of {total:,}" if total else ""
+            typer.echo(f"note: {what}{share}; {due:.0f} s so far", err=True)
+            said += 1
+
+
+def _terminal() -> bool:
+    return sys.stderr is not None and sys.stderr.isatty()
+
+
+_now: list[Shown] = []
 
 
 @contextmanager
-def shown() -> Iterator[Shown]:
-    """Show progress, and leave the terminal as it was whatever happens."""
-    progress = Shown()
+def shown() -> Iterator[None]:
+    """Show the progress of the work inside, and leave the terminal as it was whatever happens."""
+    _now.append(Shown())
     try:
-        yield progress
+        with listening(_now[-1]):
+            yield
     finally:
+        _now.pop().stop()
+
+
+def quiet() -> None:
+    """Say no more: what comes now is the answer, or tells of its progress itself."""
+    for progress in _now:
         progress.stop()

@@ -61,15 +61,13 @@ def reproduce(
     timing: 1000 Monte Carlo runs of the Local Fusion Graph took 12,000 s there, the simplified formulation 2 s; here
     the same pair, and the exact general formulation.
     """
-    from stochfuse.cli.progress import shown
     from stochfuse.errors import UsageError
     from stochfuse.thesis import Bench, find, sheet
 
     if plot is not None and what in (None, "statements", "all", "timing"):
         raise UsageError("--plot: expected the key of a figure, such as figure-32, to draw")
     if what == "all":
-        with shown() as progress:
-            _everything(Bench(seed=seed, progress=progress), output, format)
+        _everything(Bench(seed=seed), output, format)
         return
     check_files(output, plot)
     if what is None:
@@ -81,12 +79,11 @@ def reproduce(
             item = find(what)
             if plot is not None and item.panels is None:
                 raise UsageError(f"--plot: {item.key.replace('-', ' ')} is a table of parameters, with nothing to draw")
-        with shown() as progress:
-            bench = Bench(seed=seed, progress=progress)
-            if what == "statements":
-                _statements(bench, format, output)
-                return
-            found = sheet(what, bench)
+        bench = Bench(seed=seed)
+        if what == "statements":
+            _statements(bench, format, output)
+            return
+        found = sheet(what, bench)
         if plot is not None:
             from stochfuse.report.reproductions import plot_sheet
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,6 +25,8 @@ from stochfuse.cli.options import (
     ScenarioArgument,
     StepsOption,
     check_files,
+    check_memory,
+    chosen_format,
     load,
     settings_for,
     whose,
@@ -114,9 +115,9 @@ def solve(
         **settings_for([method.value], estimator=estimator, max_graphs=max_graphs),
     }
     given, links = load(scenario, agents, steps, architecture, q, r, p0, link)
+    check_memory(given, links, chosen_format(format, output))
     asked["agent"] = whose(agent, given)
-    with _progress(method) as asked["progress"]:
-        sheet, found = _answer(kind, given, links, target, case, max_agents, digits, asked)
+    sheet, found = _answer(kind, given, links, target, case, max_agents, digits, asked)
     _note(sheet)
     if plot is not None:
         from stochfuse.report.solutions import plot_solution
@@ -202,11 +203,3 @@ def _note(sheet: Sheet) -> None:
         typer.echo(f"note: {note}", err=True)
     if sheet.question.metric.mixed:
         typer.echo(f"note: {sheet.question.metric.name} adds up different units; see --metric", err=True)
-
-
-def _progress(method: Method) -> AbstractContextManager[Any]:
-    if method not in (Method.general, Method.naive):
-        return nullcontext()
-    from stochfuse.cli.progress import shown
-
-    return shown()

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stochfuse.cli.options import DigitsOption, Format, write_report
+from stochfuse.cli.progress import quiet
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -101,6 +102,7 @@ def study(
             raise UsageError(f"{option}: expected --plot or --pareto")
     if dask is not None and workers != 1:
         raise UsageError("--workers: expected nothing with --dask, whose cluster has its own")
+    quiet()
     with _executor(dask, workers) as (executor, width), _shown() as progress:
         try:
             results = run(study, output, workers=width, executor=executor, restart=restart, progress=progress)

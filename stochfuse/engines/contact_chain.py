@@ -51,6 +51,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.engines.events import Event, events
+from stochfuse.engines.progress import listener
 from stochfuse.errors import UsageError
 from stochfuse.kalman.kernel import (
     AsTheyAre,
@@ -391,7 +392,9 @@ def blocks_of_rows(contacts: Contacts, rows: int) -> Iterator[slice]:
 def transitions(contacts: Contacts, steps: int, some: slice | np.ndarray) -> Iterator[np.ndarray]:
     """T of every step in turn."""
     T = contacts.transition(1, some)
+    progress = listener()
     for step in range(1, steps + 1):
+        progress.advance("contact chain", step, steps)
         yield T
         if step < steps and not contacts.constant:
             T = contacts.transition(step + 1, some)

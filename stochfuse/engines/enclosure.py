@@ -34,6 +34,7 @@ from stochfuse.engines.contact_chain import (
     leading,
     transitions,
 )
+from stochfuse.engines.progress import listener
 from stochfuse.kalman.kernel import factor, from_factor
 
 GRID = 800
@@ -107,8 +108,9 @@ def _on_a_grid(given: Filter, contacts: Contacts, steps: int, some: slice) -> tu
 
 def _nodes(start: np.ndarray, after: Callable[[np.ndarray, int], np.ndarray], steps: int) -> np.ndarray:
     least, most = start.min(), start.max()
-    extremes = [least, most]
+    extremes, progress = [least, most], listener()
     for step in range(2, steps + 1):
+        progress.advance("bounds", step, steps)
         least, most = after(np.array([least]), step).min(), after(np.array([most]), step).max()
         extremes += [least, most]
     # 0 below all: what is moved down from anywhere can only lower the expectation

@@ -30,7 +30,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from stochfuse.engines.events import Event, Outcome, Rows, Weights, concerning, fates, outcomes
-from stochfuse.engines.progress import Progress, uncollected
+from stochfuse.engines.progress import listener, uncollected
 from stochfuse.errors import TooManyError
 from stochfuse.estimators.protocol import AdditiveEstimator, Estimator
 
@@ -126,7 +126,7 @@ class Structure(NamedTuple):
     outcomes: list[int]
 
 
-def enumerate_outcomes(estimator: Estimator, request: Request, progress: Progress | None = None) -> Structure:
+def enumerate_outcomes(estimator: Estimator, request: Request) -> Structure:
     """List what can be claimed at every step.
 
     Raises
@@ -135,10 +135,10 @@ def enumerate_outcomes(estimator: Estimator, request: Request, progress: Progres
         If more states than `request.most` have to be carried.
     """
     with uncollected():
-        return _enumerate(estimator, request, progress or Progress())
+        return _enumerate(estimator, request)
 
 
-def _enumerate(estimator: Estimator, request: Request, progress: Progress) -> Structure:
+def _enumerate(estimator: Estimator, request: Request) -> Structure:
     weights, n, steps = request.weights, request.agents, request.steps
     drawn = [request.events(step) for step in range(1, steps + 1)]
     events_up_to = np.cumsum([len(d) for d in drawn]).tolist()
@@ -175,10 +175,10 @@ def _enumerate(estimator: Estimator, request: Request, progress: Progress) -> St
                 beyond = in_the_end if hopeless else expected
                 _check_size(beyond, number[steps], request)
             if not announced and expected > LONG:
-                progress.expect(number[steps], in_the_end)
+                listener().expect(number[steps], in_the_end)
                 announced = True
             possible = outcomes(before, n, request.delay, left, weights)
-            layer = _next_layer(estimator, layer, possible, step - 1, request, progress)
+            layer = _next_layer(estimator, layer, possible, step - 1, request)
             layer = dict(zip(layer, weights.between(list(layer.values())), strict=True)) if weights.memory else layer
             if request.prune and len(layer) > request.most:
                 layer = _likeliest(layer, request)
@@ -187,7 +187,7 @@ def _enumerate(estimator: Estimator, request: Request, progress: Progress) -> St
         if not two_steps:
             endings.append(_ending(estimator, layer, last, degree, events_up_to[step - 1], step, request))
     if not announced:
-        progress.expect(number[steps], sizes[-1])
+        listener().expect(number[steps], sizes[-1])
     return Structure(endings, sizes, number[1:])
 
 
@@ -197,10 +197,9 @@ def _next_layer(
     possible: list[Outcome],
     step: int,
     request: Request,
-    progress: Progress,
 ) -> dict[Any, Any]:
     times, found = request.weights.times, {}
-    total = len(layer)
+    total, progress = len(layer), listener()
     for done, (state, weight) in enumerate(layer.items()):
         exchange = state if request.plain else estimator.exchange(state)
         for outcome in possible:
@@ -211,7 +210,7 @@ def _next_layer(
             new = times(weight, outcome.factor)
             known = found.get(after)
             found[after] = new if known is None else known + new
-        progress.advance(step, done + 1, total)
+        progress.advance(f"step {step}", done + 1, total)
     return found
 
 
@@ -323,7 +322,11 @@ def _two_step_ending(
             sign = 1 if size % 2 else -1
             terms += [(sign, table.common([heard[i] for i in T])) for T in combinations(members, size)]
         views.append((terms, starts, factors, shares))
-    ids = np.array([table.values(estimator.exchange(state)) for state in layer])
+    ids, progress = [], listener()
+    for done, state in enumerate(layer, start=1):
+        ids.append(table.values(estimator.exchange(state)))
+        progress.advance(f"steps {step - 1} and {step}", done, len(layer))
+    ids = np.array(ids)
     made = [View(ids, tuple((s, i) for s, i in terms if i is not None), *rest) for terms, *rest in views]
     return Ending(step, weights.table(list(layer.values()), degree), made, events)
 

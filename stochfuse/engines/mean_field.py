@@ -19,6 +19,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from stochfuse.engines.progress import listener
 from stochfuse.kalman.arrivals import Arrivals
 from stochfuse.kalman.averaged_update import (
     noise_factor,
@@ -371,11 +372,12 @@ def run(form: Form, steps: int, out: np.ndarray) -> np.ndarray:
     ndarray
         (items,) smallest share of prior variance that any update left.
     """
-    carried = form.start()
+    carried, progress = form.start(), listener()
     form.covariance(carried, out[0])
     for step in range(2, steps + 1):
         carried = form.advance(carried, step)
         form.covariance(carried, out[step - 1])
+        progress.advance("step", step, steps)
     return carried.left
 
 

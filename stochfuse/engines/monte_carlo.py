@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.engines.events import Event
-from stochfuse.engines.progress import uncollected
+from stochfuse.engines.progress import listener, uncollected
 from stochfuse.estimators.protocol import Claims, Estimator, Exchange, Late
 from stochfuse.kalman.kernel import Estimate
 
@@ -66,15 +66,12 @@ class Sample(NamedTuple):
     which: np.ndarray
 
 
-def sample(
-    experiment: Experiment, rows: int, *, workers: int = 1, progress: Callable[[int, int], None] | None = None
-) -> Sample:
+def sample(experiment: Experiment, rows: int, *, workers: int = 1) -> Sample:
     """Draw `runs` histories for every row.
 
     Parameters
     ----------
     workers : processes that share the work; the sample does not depend on them.
-    progress : called with parts of the work done and in all.
     """
     blocks = [(row, block) for row in range(rows) for block in range(-(-experiment.runs // BLOCK))]
     # few large parts: the more runs a process has in hand, the more histories it meets twice
@@ -100,8 +97,7 @@ def sample(
                 index[row, block * BLOCK : block * BLOCK + runs] = which[first : first + runs]
                 first += runs
             values.append(kept)
-            if progress:
-                progress(done, len(parts))
+            listener().advance("sampling", done, len(parts))
     columns = zip(*values, strict=True)
     return Sample(type(values[0])(*(None if c[0] is None else np.concatenate(c) for c in columns)), index)
 

@@ -1,10 +1,15 @@
-"""Engines average an estimator over chance."""
+"""What long work says of how far it is, to whoever listens.
+
+An engine does not know who asked.  It says `listener().advance("step 3", done, total)`, and whoever wants to know of
+the work wraps it in `with listening(progress):`; without that nobody hears it, and it costs nothing worth naming.
+"""
 
 from __future__ import annotations
 
 import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 
 
 @contextmanager
@@ -25,5 +30,23 @@ class Progress:
     def expect(self, outcomes: int, graphs: int) -> None:
         """Told once, before long work starts: number of outcomes, and of different states in the last layer."""
 
-    def advance(self, step: int, done: int, total: int) -> None:
-        """Told within a step; step 0 stands for work that is not divided into steps."""
+    def advance(self, what: str, done: int, total: int) -> None:
+        """Told within a piece of work: so much of it is done."""
+
+
+_LISTENER: ContextVar[Progress] = ContextVar("listener", default=Progress())  # noqa: B039
+
+
+def listener() -> Progress:
+    """Return who listens."""
+    return _LISTENER.get()
+
+
+@contextmanager
+def listening(progress: Progress) -> Iterator[None]:
+    """Let `progress` hear of the work inside."""
+    token = _LISTENER.set(progress)
+    try:
+        yield
+    finally:
+        _LISTENER.reset(token)

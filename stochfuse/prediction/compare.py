@@ -15,7 +15,7 @@ from stochfuse.kalman.metrics import Metric
 from stochfuse.prediction.predict import choose, predict
 from stochfuse.prediction.quantities import QUANTITIES
 from stochfuse.prediction.result import Prediction
-from stochfuse.scenario.registry import ESTIMATORS, METHODS
+from stochfuse.scenario.registry import CHAIN, ESTIMATORS, METHODS, OPTIMAL
 from stochfuse.scenario.scenario import Scenario, link_rows
 
 DEFAULT_METHODS = ("general", "simplified", "naive", "monte-carlo")
@@ -85,6 +85,8 @@ def compare(
         raise UsageError(f"methods: expected at least one of {', '.join(METHODS)}, got none")
     for method in methods:
         choose("methods", method, METHODS)
+    methods = [OPTIMAL if method == CHAIN else method for method in methods]
+    reference = OPTIMAL if reference == CHAIN else reference
     if len(set(methods)) < len(methods):
         raise UsageError(f"methods: expected different ones, got {', '.join(methods)}")
     if quantity == "optimal" and len(methods) > 1:
@@ -187,7 +189,7 @@ def _estimated(
 ) -> Prediction:
     if method is not None:
         return predict(scenario, link, method, quantity, estimator=estimator, **settings)
-    easy = {"max_graphs": EASY, **settings, "progress": None}
+    easy = {"max_graphs": EASY, **settings}
     network = scenario.network
     exchange = len(events(network, link_rows(scenario, link), 1)) * log2(len(network.delay) + 1)
     if {"runs", "seed", "workers"} & set(settings) or exchange > EASY_EXCHANGE:

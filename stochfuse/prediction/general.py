@@ -35,6 +35,7 @@ from stochfuse.engines.events import (
     weights_for,
 )
 from stochfuse.engines.precision import NO_DIGIT, PROMISED, MovedSources, change, moved_claims, notes, reach, suspects
+from stochfuse.engines.progress import listener
 from stochfuse.errors import NoAnswerError, StochfuseError, TooManyError, UsageError
 from stochfuse.estimators.ledger import InformationClaims, evaluate
 from stochfuse.estimators.making import make, sources
@@ -189,8 +190,11 @@ class Outcomes:
         return self._expectations(self.values)
 
     def _expectations(self, values: Claims) -> list[tuple[list[Any], float]]:
-        steps = range(1, self.system.steps + 1)
-        return [_expectation(self.found.shared_out(step, values), self._of) for step in steps]
+        found, steps = [], self.system.steps
+        for step in range(1, steps + 1):
+            found.append(_expectation(self.found.shared_out(step, values), self._of))
+            listener().advance("averaging", step, steps)
+        return found
 
     @cached_property
     def rounding(self) -> float:
@@ -484,7 +488,7 @@ def outcomes(
     Parameters
     ----------
     links : rows of link probabilities.
-    how : estimator, limits and progress.
+    how : estimator and limits.
     records : measurements (steps, agents, p) where states are wanted.
     errors : whether the moments of the actual error are wanted too; not with records.
     plain : merge nothing.
@@ -574,7 +578,7 @@ def _enumerated(
         prune=how.prune,
         plain=plain,
     )
-    return Enumerated(groups, enumerate_outcomes(made.estimator, request, how.progress), made, weights)
+    return Enumerated(groups, enumerate_outcomes(made.estimator, request), made, weights)
 
 
 def _over_items(system: System, link: np.ndarray, items: Items, how: Settings, errors: bool) -> Averaged:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.engines.progress import Progress
 from stochfuse.kalman.checks import covariance_fault, first_fault
 from stochfuse.kalman.metrics import Moments
 
@@ -37,7 +36,6 @@ class Settings:
     workers : monte-carlo: processes; default: one for small samples, else one per processor.
     criterion : covariance-intersection, split-ci: what the weights minimise, "det", "trace" or "max-eig",
         in each fusion by itself: over several steps that need not be the least.
-    progress : told how far long work is, see `stochfuse.engines.progress.Progress`.
     """
 
     estimator: str = "local-fusion-graph"
@@ -47,7 +45,6 @@ class Settings:
     seed: int = SEED
     workers: int | None = None
     criterion: str = "det"
-    progress: Progress | None = None
 
 
 class Averaged(NamedTuple):

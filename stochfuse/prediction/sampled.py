@@ -119,7 +119,7 @@ def sampled(system: System, links: LinkRows, how: Settings, *, errors: bool = Fa
 
     Parameters
     ----------
-    how : runs, seed, workers, estimator and progress.
+    how : runs, seed, workers and estimator.
     errors : whether the moments of the actual error are wanted too.
 
     Raises
@@ -153,9 +153,7 @@ def sampled(system: System, links: LinkRows, how: Settings, *, errors: bool = Fa
     workers = how.workers
     if workers is None:
         workers = len(os.sched_getaffinity(0)) if how.runs * rows >= MANY else 1
-    progress = how.progress
-    told = None if progress is None else lambda done, total: progress.advance(0, done, total)
-    drawn = sample(experiment, rows, workers=workers, progress=told)
+    drawn = sample(experiment, rows, workers=workers)
     return Sampled(drawn, groups_alike(network, links, kinds, permutations))
 
 

@@ -9,19 +9,26 @@ The answer carries its own proof.  By monotonicity, g(P₋) ≥ P₋ puts the fi
 the positive-definite order; P₋ = (1−ε)P and P₊ = (1+ε)P are tried for ε = 1e-12, 1e-11, … and the first ε that brackets
 is reported as the relative bound.  A bracket counts only if it holds by more than rounding can do: by `ROUNDING`, in
 units of the states' standard deviations, with g evaluated in square-root form, whose error there is below 1e-14.
+
+That there is none can be proved at no cost (theory section 16).  For an eigenvector w of F, F w = λ w, let
+φ(P) = 1/(wᴴ P⁻¹ w): it is monotone and concave, the prediction multiplies it by |λ|² at least, and an update with
+H w = 0 leaves it as it is.  So φ(g_µ(P)) ≥ p |λ|² φ(P) + p φ(Q), p the probability that nothing that arrives sees w; it
+grows without end where p |λ|² > 1, and where p |λ|² = 1 and Q is positive definite.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from stochfuse.engines.mean_field import CANCELLATION, Case, Form, MeasurementSpace, Outcomes, SquareRoot
+from stochfuse.engines.progress import listener
 from stochfuse.errors import NoAnswerError, UsageError
 from stochfuse.kalman.averaged_update import basis, triangle
+from stochfuse.kalman.kernel import at_step
 from stochfuse.prediction import simplified
 from stochfuse.scenario.model import Model, Sensor
 from stochfuse.scenario.network import LinkRows
@@ -83,6 +90,8 @@ def steady_state(scenario: Scenario, link: Sequence[float] | LinkRows | None = N
     for group in groups:
         if isinstance(group.case, Case):
             _require_detectable(scenario.model, group.case.sensor.at(2), scenario.P0)
+        else:
+            _require_bounded(group.case)
         P = _solve(group.case)
         residual, bound = _certify(group.case, P)
         shape = (len(rows.link), group.columns)
@@ -106,6 +115,29 @@ def _require_detectable(model: Model, sensor: Sensor, P0: np.ndarray) -> None:
                     f"no steady state: the stand-alone filter does not converge, since the mode of F with eigenvalue "
                     f"{eigenvalue:.6g} is not observed by H"
                 )
+
+
+def _require_bounded(case: Outcomes) -> None:
+    """Raise NoAnswerError where a direction must grow, see the module's text."""
+    F, Q, weights = at_step(case.model.F, 2), at_step(case.model.Q, 2), case.weights[1]
+    for eigenvalue, w in _modes(F):
+        seen = np.array([np.linalg.norm(s.at(2).H @ w) > 1e-10 * np.linalg.norm(s.at(2).H) for s in case.sensors])
+        unseen = (case.counts[:, seen] == 0).all(axis=1)
+        growth = float(weights[unseen].sum(axis=0).max()) * abs(eigenvalue) ** 2
+        certain = 1.0 - 1e-12 if np.linalg.eigvalsh(Q)[0] > 0 else 1.0 + 1e-12
+        if growth >= certain:
+            raise NoAnswerError(
+                f"no steady state: the mode of F with eigenvalue {eigenvalue:.6g} grows by a factor of at least "
+                f"{growth:.6g} in every step, on average over what arrives: too often nothing that arrives shows it"
+            )
+
+
+def _modes(F: np.ndarray) -> Iterator[tuple[complex, np.ndarray]]:
+    """Eigenvalues of F on or outside the unit circle, and vectors of their eigenspaces."""
+    eigenvalues, vectors = np.linalg.eig(F)
+    for eigenvalue, w in zip(eigenvalues, vectors.T, strict=True):
+        if abs(eigenvalue) >= 1.0:
+            yield (eigenvalue.real if eigenvalue.imag == 0 else eigenvalue), w
 
 
 def _apply(case: Case | Outcomes, P: np.ndarray) -> np.ndarray:
@@ -143,6 +175,7 @@ def _solve(case: Case | Outcomes) -> np.ndarray:
         for _ in range(WARM_UP):
             P = _apply(case, P)
         steps += WARM_UP
+        listener().advance("steady state", steps, PLAIN)
         if not np.isfinite(P).all() or np.abs(P).max() > 1e200:
             break
         P, residual = _newton(case, P)

@@ -146,7 +146,8 @@ class GeneralForm:
             raise UsageError(f"step {self.step} of {self.agents} agents has too many outcomes for an exact form")
         found: dict[int, list[Any]] = {}
         for view in ending.views:
-            share = view.shares[0]
+            # agents are alike, whether or not relabellings were found that show it
+            share = sum(s * (len(g) / self.agents) for s, g in zip(view.shares, groups, strict=True) if s is not None)
             factor_of = np.repeat(view.factors, np.diff([*view.starts, len(view.terms[0][1])]), axis=0)
             for ids, weight in zip(view.ids, ending.weights, strict=True):
                 for cell, factor in enumerate(factor_of):

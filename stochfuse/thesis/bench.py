@@ -34,7 +34,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.engines.events import bernstein, relabellings
-from stochfuse.engines.progress import Progress
 from stochfuse.prediction.general import Outcomes, outcomes
 from stochfuse.prediction.method import Settings
 from stochfuse.prediction.predict import predict
@@ -241,12 +240,10 @@ class Bench:
     ----------
     steps : number of time steps, 5 in the thesis.
     seed : of the records of truth and measurements.
-    progress : told how far long work is.
     """
 
     steps: int = 5
     seed: int = 1
-    progress: Progress | None = None
     known: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     def once(self, key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
@@ -267,10 +264,7 @@ class Bench:
 
         def make() -> list[Averages]:
             scenario = self.scenario(case, architecture)
-            # other networks take no time that is worth a word
-            told = self.progress if architecture == "ad-hoc" else None
-            how = Settings(estimator=rule, progress=told)
-            found = outcomes(scenario.system, link_rows(scenario, LINKS), how, errors=errors)
+            found = outcomes(scenario.system, link_rows(scenario, LINKS), Settings(estimator=rule), errors=errors)
             turns = [
                 noise_order(p, self.steps) for p in relabellings(scenario.network, found.links, scenario.sensor_of)
             ]

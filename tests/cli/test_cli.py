@@ -571,7 +571,7 @@ def test_an_input_is_never_overwritten(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["predict", "--estimator", "naive"], "--estimator: expected method general or monte-carlo, got simplified"),
+        (["predict", "--estimator", "naive", "--method", "simplified"], "--estimator: expected method general or monte-carlo, got simplified"),
         (["predict", "--method", "general", "--runs", "5"], "--runs: expected method monte-carlo, got general"),
         (["predict", "--method", "monte-carlo", "--prune"], "--prune: expected method general or naive, got monte-carlo"),
         (["compare", "--methods", "general,naive", "--seed", "5"], "--seed: expected method monte-carlo, got general, naive"),
@@ -584,7 +584,7 @@ def test_an_input_is_never_overwritten(tmp_path):
         (["predict", "cv-2d", "--method", "general", "--steps", "2", "--statistic", "derivative"], "derivative: expected metric trace or var:STATE of quantity claimed or actual, or the bias of one state, got 'rms:x,y' of claimed"),
         (["predict", "--method", "general", "--steps", "9"], "more than --max-graphs 100000"),
         (["predict", "--method", "monte-carlo", "--runs", "1"], "Invalid value for '--runs'"),
-        (["compare", "--methods", "simplified,guess"], "methods: expected one of simplified, general, optimal, naive, monte-carlo, got 'guess'"),
+        (["compare", "--methods", "simplified,guess"], "methods: expected one of simplified, general, chain, optimal, naive, monte-carlo, got 'guess'"),
         (["crosscheck", "nowhere.csv"], "nowhere.csv: no such file"),
         (["graph", "nowhere.toml"], "no such file, and no history of that name (known: thesis-example)"),
         (["derive", "general", "--step", "3"], "too many for a closed form"),

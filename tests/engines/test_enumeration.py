@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import stochfuse as sf
-from stochfuse.engines.progress import Progress
+from stochfuse.engines.progress import Progress, listening
 from stochfuse.kalman.metrics import metric
 from stochfuse.scenario.scenario import link_rows
 from tests.benchmarks import literal
@@ -225,13 +225,14 @@ class Recorder(Progress):
     def expect(self, outcomes, graphs):
         self.told.append((outcomes, graphs))
 
-    def advance(self, step, done, total):
-        self.steps.append((step, done, total))
+    def advance(self, what, done, total):
+        self.steps.append((what, done, total))
 
 
 def test_work_is_announced_before_it_starts():
     recorder = Recorder()
-    sf.predict(sf.load_scenario(architecture="cyclic", steps=6), [0.5], method="general", progress=recorder)
+    with listening(recorder):
+        sf.predict(sf.load_scenario(architecture="cyclic", steps=6), [0.5], method="general")
     ((number, graphs),) = recorder.told
     assert number == 2**18
     assert 1000 < graphs < 3000  # 1376 in the end
@@ -339,7 +340,7 @@ def test_pruning_reports_what_was_left_out():
     ("change", "error", "message"),
     [
         ({"P0": 0}, sf.UsageError, "initial.P: expected an invertible covariance for the Local Fusion Graph, got a singular one"),
-        ({"F": 0, "Q": 0}, sf.UsageError, "the covariance predicted for step 2 is singular"),
+        ({"F": 0, "Q": 0}, sf.UsageError, "expected an invertible model.F, or a model.Q that fills what it leaves out, got a singular prediction"),
     ],
 )  # fmt: skip
 def test_models_without_common_information(change, error, message):

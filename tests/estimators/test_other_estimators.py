@@ -462,7 +462,7 @@ def test_estimators_that_do_not_fit():
     for name in EQUIVALENTS:
         refused(
             CASES["unlike sensors"][0],
-            r"expected sensors that measure the same \(one H\), got another H of agent 2",
+            r"expected sensors that measure the same \(one H\), got another H; ",
             name,
         )
     scenario = sf.Scenario.from_mapping(COMMON)

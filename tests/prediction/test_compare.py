@@ -73,7 +73,7 @@ def test_reference_can_be_chosen():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((["guess"],), "methods: expected one of simplified, general, optimal, naive, monte-carlo, got 'guess'"),
+        ((["guess"],), "methods: expected one of simplified, general, chain, optimal, naive, monte-carlo, got 'guess'"),
         (([],), "methods: expected at least one of"),
         ((["naive", "naive"],), "methods: expected different ones, got naive, naive"),
         ((["naive"], "general"), r"reference: expected one of the methods compared \(naive\), got 'general'"),

@@ -265,7 +265,10 @@ def test_too_many_unlike_agents_are_refused_with_the_number():
         ({"link": np.zeros((2, 4, 4))}, "link: expected .* 3×3 matrix .* got an array of 4×4"),
         ({"link": "high"}, "link: expected link probabilities"),
         ({"link": []}, "link"),
-        ({"method": "guess"}, "method: expected one of simplified, general, optimal, naive, monte-carlo, got 'guess'"),
+        (
+            {"method": "guess"},
+            "method: expected one of simplified, general, chain, optimal, naive, monte-carlo, got 'guess'",
+        ),
         (
             {"quantity": "hope"},
             "quantity: expected one of claimed, actual, optimal, consistency, bias, rms, got 'hope'",

@@ -92,3 +92,33 @@ def test_what_varies_with_the_step_has_none():
             source["model"]["R"] = [[[1.0]]] * 4
         with pytest.raises(sf.UsageError, match="a steady state needs a model, sensors and links that do not vary"):
             sf.steady_state(sf.Scenario.from_mapping(source))
+
+
+def blind_and_seeing(F, H, link):
+    """Two agents of which the first measures nothing, so that it lives on what it hears."""
+    d = len(F)
+    return sf.Scenario.from_mapping(
+        {
+            "model": {"F": F, "H": H, "Q": np.eye(d).tolist(), "R": 1},
+            "initial": {"P": np.eye(d).tolist()},
+            "network": {"agents": 2, "steps": 2, "link": link},
+            "agent": [{"sensor": False}, {}],
+        }
+    )
+
+
+@pytest.mark.parametrize("F", [[[1.2]], [[1.2, 0.3], [0, 0.9]], [[1.2, 1.0], [0, 1.2]], [[0.9, 0.9], [-0.9, 0.9]]])
+def test_a_blind_agent_has_a_steady_state_above_the_critical_link_probability(F):
+    # whatever arrives shows every mode within d steps, and what grows is hidden with probability 1 - µ in one step
+    H = [[1.0] * len(F)] if len(F) == 1 else [[1.0, 0.5]]
+    critical = 1 - 1 / max(abs(np.linalg.eigvals(F))) ** 2
+    with pytest.raises(sf.NoAnswerError, match="grows by a factor of at least 1"):
+        sf.steady_state(blind_and_seeing(F, H, critical - 1e-4))
+    steady = sf.steady_state(blind_and_seeing(F, H, critical + 0.5 * (1 - critical)))
+    assert np.isfinite(steady.P).all()
+
+
+def test_nothing_grows_where_there_is_no_noise_to_begin_with():
+    s = blind_and_seeing([[1.0]], [[1.0]], 0.0)
+    with pytest.raises(sf.NoAnswerError, match="eigenvalue 1 grows by a factor of at least 1 in every step"):
+        sf.steady_state(s)
