@@ -444,7 +444,7 @@ def claims_of(ending: Ending, signatures: np.ndarray | None, weights: Weights) -
         size = max(1, LISTED // (cells * width))
         for first in range(0, len(view.ids), size):
             states = slice(first, first + size)
-            gathered.add(states, _keys(view, states, signatures), factor_of)
+            gathered.add(states, *_keys(view, states, signatures), factor_of)
             if gathered.full:
                 yield gathered.claimed()
                 gathered = _Gathered(view, ending, weights)
@@ -452,23 +452,26 @@ def claims_of(ending: Ending, signatures: np.ndarray | None, weights: Weights) -
             yield gathered.claimed()
 
 
-def _keys(view: View, states: slice, signatures: np.ndarray | None) -> np.ndarray:
-    """One number for what is claimed in each outcome, (states, cells), equal where claims are."""
+def _keys(view: View, states: slice, signatures: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """One number for what is claimed in each outcome, (states · cells), equal where claims are, and their order."""
     ids = view.ids[states]
     if len(view.terms) == 1 or signatures is None:
         ((_, index),) = view.terms
-        return ids[:, index]
+        keys = ids[:, index].ravel()
+        return keys, np.argsort(keys)
     keys = np.zeros((len(ids), len(view.terms[0][1]), 2), dtype=np.uint64)
     for sign, index in view.terms:
         part = signatures[ids[:, index]]
-        keys = keys + part if sign > 0 else keys - part
-    first = np.ascontiguousarray(keys[..., 0])
+        (np.add if sign > 0 else np.subtract)(keys, part, out=keys)
+    keys = keys.reshape(-1, 2)
+    first = np.ascontiguousarray(keys[:, 0])
     # two different claims share a number once in 10^19 pairs: where the second number differs, both count
-    order = np.argsort(first, axis=None, kind="stable")
-    one, other = first.ravel()[order], keys[..., 1].ravel()[order]
+    order = np.argsort(first)
+    one, other = first[order], keys[order, 1]
     if not ((one[1:] == one[:-1]) & (other[1:] != other[:-1])).any():
-        return first
-    return np.unique(keys.reshape(-1, 2), axis=0, return_inverse=True)[1].reshape(first.shape)
+        return first, order
+    both = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
+    return both, np.argsort(both)
 
 
 class _Gathered:
@@ -485,18 +488,16 @@ class _Gathered:
         """Whether the weights take as much memory as they may."""
         return len(self.place) * self._total.shape[1] > MOST_WEIGHTS
 
-    def add(self, states: slice, keys: np.ndarray, factor_of: np.ndarray) -> None:
-        """Add up the weights of some states' outcomes."""
-        view, flat = self.view, keys.ravel()
-        order = np.argsort(flat, kind="stable")
-        sorted_keys = flat[order]
+    def add(self, states: slice, keys: np.ndarray, order: np.ndarray, factor_of: np.ndarray) -> None:
+        """Add up the weights of some states' outcomes, (states · cells), in the order of their keys."""
+        view, sorted_keys = self.view, keys[order]
         starts = np.flatnonzero(np.concatenate([[True], sorted_keys[1:] != sorted_keys[:-1]]))
         before = len(self.place)
         at = np.array([self.place.setdefault(key, len(self.place)) for key in sorted_keys[starts].tolist()])
-        row, cell = np.divmod(order[starts[at >= before]], keys.shape[1])
+        row, cell = np.divmod(order[starts[at >= before]], len(factor_of))
         self._ids.append(np.stack([view.ids[states][row, index[cell]] for _, index in view.terms], axis=-1))
         pairs = self.weights.pairs(self.ending.weights[states], view.factors)
-        pair_of = (np.arange(len(keys))[:, None] * len(view.factors) + factor_of).ravel()
+        pair_of = (np.arange(len(keys) // len(factor_of))[:, None] * len(view.factors) + factor_of).ravel()
         part = np.add.reduceat(pairs.reshape(-1, pairs.shape[-1])[pair_of[order]], starts, axis=0)
         self._grow(part.shape[1])
         self._total[at] += part

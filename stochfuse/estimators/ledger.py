@@ -59,16 +59,21 @@ class Renamed:
         """Return a number that stays the same when agents of one kind change places."""
         if self._kinds is None:
             return value
-        return self._renamed(value, self._by_kind, self._kinds, self._kind_of)
+        known = self._kind_of.get(value)
+        return self._renamed(value, self._by_kind, self._kinds, self._kind_of) if known is None else known
 
     def moved(self, value: int, order: tuple[int, ...]) -> int:
         """Return the value after agents changed places: place p is taken by agent order[p]."""
         if self._kinds is None:
             return value
-        place = [0] * len(order)
-        for p, agent in enumerate(order):
-            place[agent] = p
-        return self._renamed(value, self, place, self._moved.setdefault(order, {}))
+        known = self._moved.setdefault(order, {})
+        new = known.get(value)
+        if new is None:
+            place = [0] * len(order)
+            for p, agent in enumerate(order):
+                place[agent] = p
+            new = self._renamed(value, self, place, known)
+        return new
 
     def _renamed(self, value: int, into: Any, names: Sequence[int], known: dict[int, int]) -> int:
         """Return the number, in another book, of a value whose agents got other names; `known` remembers."""

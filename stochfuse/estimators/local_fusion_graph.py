@@ -25,7 +25,7 @@ of the true state whatever it is, so that states found equal are; the property t
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from stochfuse.estimators.ledger import COMMON, Ledger
 from stochfuse.estimators.protocol import FusionRule, Late, best_relabelling
@@ -207,42 +207,42 @@ class GraphExchange:
     def _merged(self, agents: Sequence[Agent], waiting: dict[tuple[int, int], int]) -> tuple[State, tuple[int, ...]]:
         kept = self._reachable([agent.known for agent in agents], list(waiting.values()))
         nodes = [node for node in range(kept.bit_length()) if kept >> node & 1]
-        values, below, step = self.pedigrees.values, self.pedigrees.below, self.estimator.ledger.step
-        holders = [0] * len(nodes)
-        for i, agent in enumerate(agents):
-            for place, node in enumerate(nodes):
-                if agent.known >> node & 1:
-                    holders[place] |= 1 << i
+        ledger, n = self.estimator.ledger, len(agents)
+        values, below, step, moved = self.pedigrees.values, self.pedigrees.below, ledger.step, ledger.moved
+        held = [[i for i, agent in enumerate(agents) if agent.known >> node & 1] for node in nodes]
         carried = [
             tuple(sorted((r, left) for (r, left), mask in waiting.items() if mask >> node & 1)) if waiting else ()
             for node in nodes
         ]
-        # ancestors first: an earlier step, or fewer ancestors within one
-        ledger = self.estimator.ledger
-        rank = [(step[values[n]], (below[n] & kept).bit_count(), ledger.invariant(values[n])) for n in nodes]
+        # ancestors first: an earlier step, or fewer ancestors within one; in one number, which is compared at once
+        rank = [
+            ((step[values[node]] << 16 | (below[node] & kept).bit_count()) << 32 | ledger.invariant(values[node])) << n
+            for node in nodes
+        ]
+        theirs: list[list[int]] = [[] for _ in agents]
+        for place, holders in enumerate(held):
+            for i in holders:
+                theirs[i].append(rank[place] | len(holders))
         invariants = [
-            (
-                ledger.invariant(agent.value),
-                sorted((rank[p], holders[p].bit_count()) for p in range(len(nodes)) if holders[p] >> i & 1),
-                sorted(left for r, left in waiting if r == i),
-            )
+            (ledger.invariant(agent.value), sorted(theirs[i]), sorted(left for r, left in waiting if r == i))
             for i, agent in enumerate(agents)
         ]
         best: tuple[State, tuple[int, ...]] | None = None
         for order in best_relabelling(invariants, self.estimator.relabellings):
-            place_of = [0] * len(order)
+            bit, place_of = [0] * n, [0] * n
             for place, i in enumerate(order):
-                place_of[i] = place
-            keys = []
-            for p in range(len(nodes)):
-                who = sum(1 << place_of[i] for i in range(len(order)) if holders[p] >> i & 1)
-                what = tuple(sorted((place_of[r], left) for r, left in carried[p])) if carried[p] else ()
-                keys.append((rank[p], who, what))
+                place_of[i], bit[i] = place, 1 << place
+            who = [rank[p] | sum([bit[i] for i in holders]) for p, holders in enumerate(held)]
+            keys: list[Any] = who
+            if waiting:
+                keys = [
+                    (w, tuple(sorted((place_of[r], left) for r, left in c))) for w, c in zip(who, carried, strict=True)
+                ]
             sequence = _sequence(keys, nodes, below)
-            new = {nodes[p]: place for place, p in enumerate(sequence)}
+            new = {nodes[p]: 1 << place for place, p in enumerate(sequence)}
             state = State(
-                tuple((ledger.moved(values[nodes[p]], order), _moved(below[nodes[p]] & kept, new)) for p in sequence),
-                tuple(Agent(ledger.moved(agents[i].value, order), _moved(agents[i].known & kept, new)) for i in order),
+                tuple([(moved(values[nodes[p]], order), _moved(below[nodes[p]] & kept, new)) for p in sequence]),
+                tuple([Agent(moved(agents[i].value, order), _moved(agents[i].known & kept, new)) for i in order]),
                 tuple(sorted((place_of[r], left, _moved(m & kept, new)) for (r, left), m in waiting.items())),
             )
             if best is None or state < best[0]:
@@ -277,25 +277,27 @@ class GraphExchange:
         return kept
 
 
-def _sequence(keys: list[tuple], nodes: list[int], below: Sequence[int]) -> list[int]:
+def _sequence(keys: Sequence[Any], nodes: Sequence[int], below: Sequence[int]) -> list[int]:
     """Places of nodes in the order of their keys, equal ones by the keys of their ancestors and descendants."""
+    places = range(len(keys))
     if len(set(keys)) == len(keys):
-        return sorted(range(len(keys)), key=keys.__getitem__)
+        return sorted(places, key=keys.__getitem__)
     kin = [
         (
             key,
-            sorted(keys[q] for q, other in enumerate(nodes) if below[nodes[p]] >> other & 1),
-            sorted(keys[q] for q, other in enumerate(nodes) if below[other] >> nodes[p] & 1),
+            sorted([keys[q] for q in places if below[nodes[p]] >> nodes[q] & 1]),
+            sorted([keys[q] for q in places if below[nodes[q]] >> nodes[p] & 1]),
         )
         for p, key in enumerate(keys)
     ]
-    return sorted(range(len(keys)), key=kin.__getitem__)
+    return sorted(places, key=kin.__getitem__)
 
 
 def _moved(mask: int, new: dict[int, int]) -> int:
+    """A mask's nodes by their new bits."""
     moved = 0
     while mask:
         top = mask.bit_length() - 1
-        moved |= 1 << new[top]
+        moved |= new[top]
         mask ^= 1 << top
     return moved
