@@ -24,7 +24,7 @@ from stochfuse.prediction.quantities import QUANTITIES
 from stochfuse.prediction.result import Prediction
 from stochfuse.scenario import capabilities, registry
 from stochfuse.scenario.network import LinkRows
-from stochfuse.scenario.registry import CRITERIA, ESTIMATORS, METHODS
+from stochfuse.scenario.registry import CRITERIA, ESTIMATORS, METHODS, NATURES
 from stochfuse.scenario.scenario import Scenario, link_rows
 from stochfuse.scenario.system import Items, Noises, System
 
@@ -217,9 +217,10 @@ def predict_items(
         wrong = {} if way == "simplified" else faults_of(found.moments)
         faults |= {**wrong, **lost, **found.faults}
         natures.append(found.natures)
-    certain = ("exact", "sampled", "approximate", "bound")
-    worst = np.max([np.vectorize(certain.index, otypes=[int])(nature) for nature in natures], axis=0)
-    return Many([predictions[q] for q in quantities], np.array(certain)[worst], faults)
+    worst = natures[0]
+    for nature in NATURES if len(natures) > 1 else ():
+        worst = np.where(np.any([some == nature for some in natures], axis=0), nature, worst)
+    return Many([predictions[q] for q in quantities], worst, faults)
 
 
 def items_of(scenario: Scenario, link: Any, noises: Noises) -> Items:
@@ -336,13 +337,12 @@ def _room(file: str) -> Any:
 
 
 def _prediction(scenario: Scenario, rows: LinkRows, method: str, quantity: str, found: Averaged) -> Prediction:
-    certain = ("exact", "sampled", "bound", "approximate")
     return Prediction(
         scenario=scenario,
         method=method,
         quantity="optimal" if method == "optimal" and quantity == "claimed" else quantity,
         stage="posterior",
-        nature=max(map(str, found.natures), key=certain.index),
+        nature=next(nature for nature in reversed(NATURES) if (found.natures == nature).any()),
         link=rows.means(scenario.network),
         cases=rows.names,
         steps=np.arange(1, scenario.network.steps + 1),

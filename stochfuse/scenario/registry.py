@@ -260,6 +260,8 @@ STATISTIC = (
 )
 CRITERIA = ("det", "trace", "max-eig")
 """What the weights of an intersection minimise."""
+NATURES = ("exact", "sampled", "bound", "approximate")
+"""What numbers may be, the most certain first."""
 
 ESTIMATORS = tuple(e.name for e in ESTIMATOR)
 ENGINES = tuple(e.name for e in ENGINE)

@@ -20,6 +20,7 @@ from stochfuse.prediction.predict import WORTHLESS, predict_items, predict_sever
 from stochfuse.prediction.result import Prediction
 from stochfuse.questions.messages import message_load
 from stochfuse.scenario.network import restricted, uniform_rows
+from stochfuse.scenario.registry import NATURES
 from stochfuse.scenario.scenario import Scenario
 from stochfuse.scenario.system import Items, Noises
 from stochfuse.studies.plan import ERROR, MESSAGES, NODES, SETTINGS, Plan, default_method, put
@@ -246,7 +247,7 @@ def _batch(asked: _Asked, items: np.ndarray) -> np.ndarray:
         return np.concatenate([items[:0], *(_batch(asked, part) for part in parts if len(part))])
     for place, reason in found.faults.items():
         group.errors[int(items[place])] = reason
-    for nature in np.unique(found.natures).tolist():
+    for nature in (nature for nature in NATURES if (found.natures == nature).any()):
         group.mark(items[found.natures == nature], (*_kind(asked, found.predictions)[:2], nature))
     return items[:0]
 
