@@ -34,7 +34,7 @@ WRONG_WORDS: type[Exception] = next(kind for kind in typer.BadParameter.__mro__ 
 EXIT_FAILURE, EXIT_USAGE, EXIT_NO_ANSWER, EXIT_INTERRUPTED = 1, 2, 3, 130
 
 
-class Group(TyperGroup):
+class Commands(TyperGroup):
     """Commands that are built when they are asked for; their errors become one message on stderr and an exit code."""
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -102,7 +102,7 @@ def _fail(message: str, code: int) -> None:
 
 
 app = typer.Typer(
-    cls=Group,
+    cls=Commands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,

@@ -184,11 +184,11 @@ def _methods(
 ) -> None:
     from stochfuse.prediction.compare import compare as run
     from stochfuse.report import comparisons
-    from stochfuse.report.predictions import View
+    from stochfuse.report.predictions import PredictionView
 
     found = run(scenario, links, methods, reference, quantity, **settings)
     view = comparisons.ComparisonView(
-        found, tuple(View(p, how.metric, how.agent, None, how.digits) for p in found.predictions), relative
+        found, tuple(PredictionView(p, how.metric, how.agent, None, how.digits) for p in found.predictions), relative
     )
     view.values()
     for prediction in found.predictions:

@@ -29,7 +29,7 @@ from stochfuse.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from stochfuse.questions.results import Results
+    from stochfuse.questions.results import SimulatorResults
     from stochfuse.scenario.network import LinkRows
     from stochfuse.scenario.scenario import Scenario
 
@@ -81,7 +81,7 @@ def crosscheck(
     from stochfuse.questions.crosscheck import check_results
     from stochfuse.questions.results import read_results
     from stochfuse.report import crosschecks
-    from stochfuse.report.predictions import View
+    from stochfuse.report.predictions import PredictionView
 
     check_files(output, None, file, scenario)
     settings = settings_for([method.value], max_graphs=max_graphs, prune=prune)
@@ -101,7 +101,7 @@ def crosscheck(
     chosen = metric_of(metric or given.metric or "trace", given.model)
     prediction = _predict(given, _rows(results, given), method, settings)
     verdict = check_results(results, prediction, chosen, alpha)
-    shown = crosschecks.CrosscheckView(results, View(prediction, chosen, "mean", None, digits), verdict)
+    shown = crosschecks.CrosscheckView(results, PredictionView(prediction, chosen, "mean", None, digits), verdict)
     for note in prediction.notes:
         typer.echo(f"note: {note}", err=True)
     if method is Against.simplified:
@@ -125,7 +125,7 @@ def crosscheck(
         raise typer.Exit(1)
 
 
-def _rows(results: Results, scenario: Scenario) -> LinkRows:
+def _rows(results: SimulatorResults, scenario: Scenario) -> LinkRows:
     """Rows of the prediction for the file's link probabilities or names of cases."""
     from stochfuse.questions.results import ResultsError
     from stochfuse.scenario.network import stacked_rows

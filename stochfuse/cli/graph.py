@@ -63,7 +63,7 @@ def graph(
         given = load_scenario(scenario, agents=n, steps=steps, uniform_link=True)
         metric = metric_of(given.metric or "trace", given.model)
         claimed = {node: float(metric.of(estimate.P)) for node, estimate in made.estimates(given).items()}
-        values = report.Claimed(metric, claimed)
+        values = report.ClaimedAtNodes(metric, claimed)
     if plot is not None:
         report.plot(made, explanations[0], plot)
     if format is GraphFormat.json:

@@ -44,7 +44,7 @@ from stochfuse.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from stochfuse.report.predictions import View
+    from stochfuse.report.predictions import PredictionView
 
 
 class Method(StrEnum):
@@ -108,7 +108,7 @@ def predict(
     from stochfuse.kalman.metrics import metric as metric_of
     from stochfuse.prediction.predict import predict_several as run
     from stochfuse.prediction.quantities import check
-    from stochfuse.report.predictions import View
+    from stochfuse.report.predictions import PredictionView
 
     check_files(output, plot, scenario)
     quantities = quantity_names(quantity)
@@ -147,7 +147,8 @@ def predict(
     found = run(given, links, asked, quantities, **settings)
     at_zero = run(given, [0.0], asked, quantities, **settings) if normalise else [None] * len(found)
     views = tuple(
-        View(p, chosen, chosen_agent, baseline, digits, statistic) for p, baseline in zip(found, at_zero, strict=True)
+        PredictionView(p, chosen, chosen_agent, baseline, digits, statistic)
+        for p, baseline in zip(found, at_zero, strict=True)
     )
     for view in views:
         view.values()  # a request that cannot be met should say so before notes and figures
@@ -158,7 +159,7 @@ def predict(
         _report_several(views, format, output, plot)
 
 
-def _report(view: View, format: Format | None, output: Path | None, plot: Path | None) -> None:
+def _report(view: PredictionView, format: Format | None, output: Path | None, plot: Path | None) -> None:
     from stochfuse.report import predictions
 
     if plot is not None:
@@ -174,7 +175,9 @@ def _report(view: View, format: Format | None, output: Path | None, plot: Path |
     )
 
 
-def _report_several(views: tuple[View, ...], format: Format | None, output: Path | None, plot: Path | None) -> None:
+def _report_several(
+    views: tuple[PredictionView, ...], format: Format | None, output: Path | None, plot: Path | None
+) -> None:
     from stochfuse.report import predictions as side_by_side
 
     if plot is not None:
@@ -188,7 +191,7 @@ def _report_several(views: tuple[View, ...], format: Format | None, output: Path
     )
 
 
-def _warn(views: tuple[View, ...]) -> None:
+def _warn(views: tuple[PredictionView, ...]) -> None:
     first = views[0]
     if first.prediction.sampled is not None and first.agent in ("worst", "best") and not first.prediction.alike:
         typer.echo(

@@ -35,7 +35,7 @@ from stochfuse.cli.options import (
 from stochfuse.cli.predict import Method
 
 if TYPE_CHECKING:
-    from stochfuse.report.solutions import Sheet
+    from stochfuse.report.solutions import SolutionSheet
     from stochfuse.scenario.scenario import Scenario
 
 
@@ -160,7 +160,7 @@ def _answer(
     max_agents: int | None,
     digits: int,
     asked: dict[str, Any],
-) -> tuple[Sheet, Any]:
+) -> tuple[SolutionSheet, Any]:
     from stochfuse.questions import agents_needed, least_link, sensitivity
     from stochfuse.questions.question import question
     from stochfuse.report import solutions
@@ -192,7 +192,7 @@ def _single(links: list[float] | None, kind: str) -> float:
     return links[0]
 
 
-def _note(sheet: Sheet) -> None:
+def _note(sheet: SolutionSheet) -> None:
     if sheet.kind == "sensitivity" and sheet.question.method == "simplified" and sheet.question.agent != "mean":
         typer.echo(
             "note: the simplified formulation lets an agent's prior stand for the others' too, so that only links to "

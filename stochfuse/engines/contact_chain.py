@@ -272,7 +272,7 @@ MOST_NUMBERS = 20_000_000
 """Transition probabilities, or weights of paths, that are held at a time."""
 
 
-class Carried(NamedTuple):
+class AlongPath(NamedTuple):
     """What is left of the initial error, (..., d, 1), and the covariance: its square root for several components.
 
     A covariance of several components would lose the digits of precise sensors to the subtraction in its update.  The
@@ -283,7 +283,7 @@ class Carried(NamedTuple):
     root: np.ndarray
 
 
-class Filter(NamedTuple):
+class LosslessFilter(NamedTuple):
     """What an agent that loses nothing would compute.
 
     One filter for all rows of link probabilities, or one for each: then noises have an axis of rows, see
@@ -306,13 +306,13 @@ class Filter(NamedTuple):
     error: np.ndarray | None = None
     numbers: Numbers = AsTheyAre()
 
-    def start(self, counts: np.ndarray) -> Carried:
+    def start(self, counts: np.ndarray) -> AlongPath:
         """Estimate from so many agents' initial ones, and what it leaves of the error."""
         x = np.zeros((self.model.dimension, 1)) if self.error is None else self.error
         P = (self.P0 if self.shared else self.P0 / counts.sum())[None]
-        return Carried(np.broadcast_to(x, (*P.shape[:-1], 1)), P if self.scalar else self.numbers.factor(P))
+        return AlongPath(np.broadcast_to(x, (*P.shape[:-1], 1)), P if self.scalar else self.numbers.factor(P))
 
-    def after(self, before: Carried, counts: np.ndarray, step: int) -> Carried:
+    def after(self, before: AlongPath, counts: np.ndarray, step: int) -> AlongPath:
         """Predict to a step and take in the measurements of so many agents of each kind; of errors, if there are.
 
         Of one kind, the numbers may be a stack (..., 1) that goes with the estimate's.
@@ -327,15 +327,15 @@ class Filter(NamedTuple):
                 J = H.T @ np.linalg.solve(R, H)  # all that a measurement of a scalar says, whatever its size
                 if J.any():
                     estimate = update(estimate, np.ones((1, 1)), 1.0 / (J * n[..., None, None]), np.zeros((1, 1)))
-            return Carried(*estimate)
+            return AlongPath(*estimate)
         x, L = before.x, given.rounded(predict_factor(given.rounded(before.root), F, given.factor(Q)))
         x = x if x is None else F @ x
         for H, R, n in arrived:
             L = update_factor(L, H, R, lambda s: 1.0 / (1.0 + n[..., None] * s))  # noqa: B023
             x = x if x is None else x - posterior_gain(L, H, R / n[..., None, None]) @ (H @ x)
-        return Carried(x, L)
+        return AlongPath(x, L)
 
-    def covariance(self, carried: Carried) -> np.ndarray:
+    def covariance(self, carried: AlongPath) -> np.ndarray:
         """Covariance of what is carried."""
         return carried.root if self.scalar else from_factor(carried.root)
 
@@ -373,7 +373,7 @@ class TooManyPathsError(UsageError):
 class Class(NamedTuple):
     """Paths that end with the same counts: what each carries, and weight (rows, states of those counts, paths)."""
 
-    carried: Carried
+    carried: AlongPath
     weight: np.ndarray
 
 
@@ -419,7 +419,7 @@ def leading(
                 yield paths, alive, weight[:, :, alive]
 
 
-def expected_optimum(given: Filter, contacts: Contacts, steps: int, rows: int) -> Chain:
+def expected_optimum(given: LosslessFilter, contacts: Contacts, steps: int, rows: int) -> Chain:
     """Go through every path.
 
     Parameters
@@ -440,7 +440,9 @@ def joined(found: Sequence[tuple[list[np.ndarray], int]]) -> Chain:
     return Chain(P, b, M, np.zeros(P.shape[:2]), found[0][1])
 
 
-def over_paths(given: Filter, contacts: Contacts, steps: int, some: slice | np.ndarray) -> tuple[list[np.ndarray], int]:
+def over_paths(
+    given: LosslessFilter, contacts: Contacts, steps: int, some: slice | np.ndarray
+) -> tuple[list[np.ndarray], int]:
     """E[P], E[b] and E[P + b bᵀ] of some rows, each (rows, steps, groups, …), and the number of paths.
 
     Parameters
@@ -470,7 +472,7 @@ def over_paths(given: Filter, contacts: Contacts, steps: int, some: slice | np.n
 
 
 def _closed(
-    given: Filter, classes: dict[int, Class], T: np.ndarray, states: list[np.ndarray], starts: Sequence[int]
+    given: LosslessFilter, classes: dict[int, Class], T: np.ndarray, states: list[np.ndarray], starts: Sequence[int]
 ) -> tuple[Any, Any, Any]:
     """E[P], E[b] and E[P + b bᵀ] over the paths, each (rows, groups, …)."""
     P, b, M = 0.0, 0.0, 0.0
@@ -488,7 +490,7 @@ def _over(weight: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _grown(
-    given: Filter,
+    given: LosslessFilter,
     classes: dict[int, Class],
     T: np.ndarray,
     counts: np.ndarray,
@@ -504,7 +506,7 @@ def _grown(
         ]
         if parts:
             x, root, weight = zip(*parts, strict=True)
-            together = Carried(np.concatenate(x), np.concatenate(root))
+            together = AlongPath(np.concatenate(x), np.concatenate(root))
             grown[c] = Class(given.after(together, counts[c], step), np.concatenate(weight, axis=2))
             paths += len(together.x)
             check_size(paths, sum(g.weight.size for g in grown.values()))

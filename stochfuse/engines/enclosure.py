@@ -23,10 +23,10 @@ from typing import NamedTuple
 import numpy as np
 
 from stochfuse.engines.contact_chain import (
-    Carried,
+    AlongPath,
     Chain,
     Contacts,
-    Filter,
+    LosslessFilter,
     blocks_of_rows,
     by_counts,
     check_size,
@@ -46,7 +46,7 @@ NOTHING = 1e-150
 """Probabilities that are left out, far below rounding: the processor is slow on products of smaller ones."""
 
 
-def enclosed_optimum(given: Filter, contacts: Contacts, steps: int, rows: int) -> Chain:
+def enclosed_optimum(given: LosslessFilter, contacts: Contacts, steps: int, rows: int) -> Chain:
     """Enclose the expected optimum.
 
     Raises
@@ -67,7 +67,7 @@ def _half_width(gap: np.ndarray, middle: np.ndarray) -> np.ndarray:
     return 0.5 * np.linalg.eigvalsh(whiten @ gap @ np.swapaxes(whiten, -1, -2))[..., -1].max(axis=2)
 
 
-def _on_a_grid(given: Filter, contacts: Contacts, steps: int, some: slice) -> tuple[np.ndarray, np.ndarray]:
+def _on_a_grid(given: LosslessFilter, contacts: Contacts, steps: int, some: slice) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper expectations, (rows, steps, groups, 1, 1), of a scalar model."""
     counts, states = by_counts(contacts)
 
@@ -76,9 +76,9 @@ def _on_a_grid(given: Filter, contacts: Contacts, steps: int, some: slice) -> tu
         out = np.empty(np.broadcast_shapes(P.shape, (len(contacts.held), 1)))
         P = np.broadcast_to(P, out.shape)[..., None, None]
         if counts.shape[1] == 1:
-            return given.after(Carried(None, P), contacts.held[:, None], step).root[..., 0, 0]
+            return given.after(AlongPath(None, P), contacts.held[:, None], step).root[..., 0, 0]
         for count, here in zip(counts, states, strict=True):
-            out[..., here, :] = given.after(Carried(None, P[..., here, :, :, :]), count, step).root[..., 0, 0]
+            out[..., here, :] = given.after(AlongPath(None, P[..., here, :, :, :]), count, step).root[..., 0, 0]
         return out
 
     start = np.empty(len(contacts.held))
@@ -146,7 +146,9 @@ def _added(nodes: np.ndarray, place: np.ndarray, mass: np.ndarray) -> np.ndarray
     return total.reshape(rows, states, len(nodes))
 
 
-def _by_last_counts(given: Filter, contacts: Contacts, steps: int, some: slice) -> tuple[np.ndarray, np.ndarray]:
+def _by_last_counts(
+    given: LosslessFilter, contacts: Contacts, steps: int, some: slice
+) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper expectations, (rows, steps, groups, d, d), by paths merged to their last counts."""
     counts, states = by_counts(contacts)
     if counts.shape[1] > 1:
@@ -186,7 +188,7 @@ class _Merged(NamedTuple):
 
 
 def _grown(
-    given: Filter,
+    given: LosslessFilter,
     classes: dict[int, _Merged],
     T: np.ndarray,
     counts: np.ndarray,
@@ -209,7 +211,7 @@ def _grown(
             kept = last[order][:, -window:]
             first = np.flatnonzero(np.concatenate([[True], (np.diff(kept, axis=0) != 0).any(axis=1)]))
             end = np.append(first[1:], len(kept)) - 1
-            low = given.after(Carried(None, np.concatenate(lows)[order[end]]), counts[c], step).root
-            high = given.after(Carried(None, np.concatenate(highs)[order[first]]), counts[c], step).root
+            low = given.after(AlongPath(None, np.concatenate(lows)[order[end]]), counts[c], step).root
+            high = given.after(AlongPath(None, np.concatenate(highs)[order[first]]), counts[c], step).root
             grown[c] = _Merged(kept[first], low, high, np.add.reduceat(weight[:, :, order], first, axis=2))
     return grown

@@ -48,7 +48,7 @@ WRITTEN_OUT = 10**30
 """Numbers from which on only the size is told."""
 
 
-class View(NamedTuple):
+class FusedSet(NamedTuple):
     """Outcomes of the last exchanges as a set of agents A sees them: Y = Σ sign · Y[ids[:, index]].
 
     Parameters
@@ -80,7 +80,7 @@ class Ending(NamedTuple):
 
     step: int
     weights: np.ndarray
-    views: list[View]
+    views: list[FusedSet]
     events: int
 
 
@@ -285,7 +285,7 @@ def _ending(
             share = weights.factors([weights.none()], 0)[0] / len(agents)
             shares = [share if g == group else None for g in range(len(request.groups))]
             cells = np.arange(len(possible))
-            views.append(View(ids, ((1, cells),), cells, factors, shares))
+            views.append(FusedSet(ids, ((1, cells),), cells, factors, shares))
     return Ending(step, weights.table(list(layer.values()), degree), views, events)
 
 
@@ -327,7 +327,7 @@ def _two_step_ending(
         ids.append(table.values(estimator.exchange(state)))
         progress.advance(f"steps {step - 1} and {step}", done, len(layer))
     ids = np.array(ids)
-    made = [View(ids, tuple((s, i) for s, i in terms if i is not None), *rest) for terms, *rest in views]
+    made = [FusedSet(ids, tuple((s, i) for s, i in terms if i is not None), *rest) for terms, *rest in views]
     return Ending(step, weights.table(list(layer.values()), degree), made, events)
 
 
@@ -452,7 +452,7 @@ def claims_of(ending: Ending, signatures: np.ndarray | None, weights: Weights) -
             yield gathered.claimed()
 
 
-def _keys(view: View, states: slice, signatures: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+def _keys(view: FusedSet, states: slice, signatures: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """One number for what is claimed in each outcome, (states · cells), equal where claims are, and their order."""
     ids = view.ids[states]
     if len(view.terms) == 1 or signatures is None:
@@ -477,7 +477,7 @@ def _keys(view: View, states: slice, signatures: np.ndarray | None) -> tuple[np.
 class _Gathered:
     """Claims of a view with their weights, while states are gone through."""
 
-    def __init__(self, view: View, ending: Ending, weights: Weights) -> None:
+    def __init__(self, view: FusedSet, ending: Ending, weights: Weights) -> None:
         self.view, self.ending, self.weights = view, ending, weights
         self.place: dict[int, int] = {}
         self._ids: list[np.ndarray] = []

@@ -6,7 +6,7 @@ sender, at once or after a delay that is drawn with it.  Sets of agents are mask
 
 Bookkeeping of how likely outcomes are, while they are gone through.
 
-With equal µ everywhere, an outcome with c successes of L events has probability µ^c (1−µ)^(L−c): the `Counts` and
+With equal µ everywhere, an outcome with c successes of L events has probability µ^c (1−µ)^(L−c): the `CountWeights` and
 `Coefficients` weights keep the factor of every c apart (theory section 5), so that one enumeration answers every µ.
 `Rows` keeps one probability per row of link probabilities instead, and `Bursty` one for every row and every way in
 which the links can be good and bad.
@@ -210,7 +210,7 @@ class _Polynomial(_Memoryless):
 
 
 @dataclass(frozen=True)
-class Counts(_Polynomial):
+class CountWeights(_Polynomial):
     """Weights by number of successes, equal µ: outcomes counted exactly, packed into one integer, `bits` apiece."""
 
     bits: int
@@ -365,7 +365,7 @@ class Bursty(Rows):
         return total.reshape(self.moves.shape[1], -1, *total.shape[1:]).sum(axis=1)
 
 
-Weights = Counts | Coefficients | Rows
+Weights = CountWeights | Coefficients | Rows
 
 
 def bursty(drawn: Sequence[Event], rows: int) -> Bursty:
@@ -388,7 +388,7 @@ def bursty(drawn: Sequence[Event], rows: int) -> Bursty:
 
 def weights_for(network: Network, number_of_events: int) -> Weights:
     """Return the cheapest exact bookkeeping by number of successes, where all µ are equal."""
-    return Counts(number_of_events + 1) if network.delay == (1.0,) else Coefficients()
+    return CountWeights(number_of_events + 1) if network.delay == (1.0,) else Coefficients()
 
 
 def bernstein(coefficients: np.ndarray, degree: int, link: np.ndarray) -> np.ndarray:

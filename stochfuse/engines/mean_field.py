@@ -5,7 +5,7 @@ prediction of the averaged covariance, the common information of any set of mess
 prior, and so m arrivals make one Kalman update with m + 1 measurements (`stochfuse.prediction.simplified`).
 
 A *form* is one way to carry the recursion numerically: `MeasurementSpace` (scalar models included), `SquareRoot` where
-the former would cancel, and `Outcomes` for unlike agents.  An *item* is one column of the batch: a row of link
+the former would cancel, and `UnlikeCase` for unlike agents.  An *item* is one column of the batch: a row of link
 probabilities, or such a row for one receiver where receivers differ.  Items may have noises Q, R and P(k0) of their own
 (`Case.noises`): what depends on them is then an array over the items where it is a number or a constant matrix else.
 """
@@ -283,7 +283,7 @@ class SquareRoot:
 
 
 @dataclass(frozen=True)
-class Outcomes:
+class UnlikeCase:
     """Unlike agents: every count of arrivals per kind of sensor, with its weight; thesis (45)/(46) merged by kind.
 
     Parameters
@@ -306,7 +306,7 @@ class Outcomes:
         """Number of items."""
         return self.weights[0].shape[1]
 
-    def take(self, items: np.ndarray) -> Outcomes:
+    def take(self, items: np.ndarray) -> UnlikeCase:
         """Return the same for some of the items."""
         chosen: dict[int, np.ndarray] = {}
         for w in self.weights:

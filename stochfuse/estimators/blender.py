@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse.estimators.recursion import RecursiveEstimator, Rule, Worked
+from stochfuse.estimators.recursion import FusionStep, RecursiveEstimator, Worked
 from stochfuse.estimators.world import World
 from stochfuse.fusion.blender import Blend, blend_all, blend_tree
 from stochfuse.fusion.parallel import ParallelFilter, ParallelFilters, parallel_filters
@@ -39,7 +39,7 @@ class Blender(RecursiveEstimator):
         """The agent's own filter, into which the blend is not fed back."""
         return self.pasts.number(step + 1, ("local", agent), (before,))
 
-    def work(self, step: int, rules: Sequence[Rule], rests_on: list[Worked]) -> Worked:
+    def work(self, step: int, rules: Sequence[FusionStep], rests_on: list[Worked]) -> Worked:
         """Blend the shaped outputs with the weights of the joint covariance."""
         members, D = rules[0][1:], len(self._shape(0))
         rows = np.concatenate([np.arange(j * D, (j + 1) * D) for j in members])

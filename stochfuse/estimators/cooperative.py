@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from stochfuse.estimators.protocol import Late
-from stochfuse.estimators.recursion import PastExchange, RecursiveEstimator, Rule, State, Worked
+from stochfuse.estimators.recursion import FusionStep, PastExchange, PastState, RecursiveEstimator, Worked
 from stochfuse.fusion.cooperative import itns_update, lwin_update
 from stochfuse.kalman.kernel import Estimate, at_step, factor, predict
 
@@ -38,7 +38,7 @@ class Lwin(RecursiveEstimator):
         rule = (RELATED, agent, *others) if self.world.own else (AGREED,)
         return self.pasts.number(step, rule, [values[j] for j in (agent, *others)])
 
-    def work(self, step: int, rules: Sequence[Rule], rests_on: list[Worked]) -> Worked:
+    def work(self, step: int, rules: Sequence[FusionStep], rests_on: list[Worked]) -> Worked:
         """One neighbour after the other."""
         own, *neighbours = (Estimate(each.x, each.P) for each in rests_on)
         _, *agents = rules[0]
@@ -63,15 +63,15 @@ class Itns(RecursiveEstimator):
     def __init__(self, world: Any, kinds: Sequence[int], relabellings: Any = None, *, errors: bool = False) -> None:
         super().__init__(world, range(world.agents), None, errors=errors)
 
-    def start(self) -> State:
+    def start(self) -> PastState:
         """The joint first estimate; every agent's value is the joint one."""
-        return State(1, (self.pasts.number(1, (JOINT_LOCAL,)),) * self.world.agents)
+        return PastState(1, (self.pasts.number(1, (JOINT_LOCAL,)),) * self.world.agents)
 
-    def exchange(self, state: State) -> JointExchange:
+    def exchange(self, state: PastState) -> JointExchange:
         """Open the exchange of the state's step."""
         return JointExchange(self, state)
 
-    def batch(self, step: int, rules: Sequence[Rule], rests_on: list[Worked]) -> Worked:
+    def batch(self, step: int, rules: Sequence[FusionStep], rests_on: list[Worked]) -> Worked:
         """Work a batch out."""
         name = rules[0][0]
         if name == JOINT_LOCAL:
@@ -131,7 +131,7 @@ class Itns(RecursiveEstimator):
     def _related_columns(self, step: int) -> int:
         return sum(at_step(relation.R, step).shape[-1] for relation in self.world.relations.values())
 
-    def _exchanged(self, step: int, rules: Sequence[Rule], before: Worked) -> Worked:
+    def _exchanged(self, step: int, rules: Sequence[FusionStep], before: Worked) -> Worked:
         """Take in what was measured between agents: each rule says between whom, receiver and sender in turn."""
         P, x = before.P.copy(), None if before.x is None else before.x.copy()
         measured = [set(zip(rule[1::2], rule[2::2], strict=True)) for rule in rules]
@@ -179,6 +179,6 @@ class JointExchange(PastExchange):
         """Value of the agent's block of the joint estimate."""
         return self.estimator.pasts.number(self.state.step, (BLOCK, agent), (self._joint(heard),))
 
-    def _next(self, heard: Sequence[int], late: Sequence[Late]) -> State:
+    def _next(self, heard: Sequence[int], late: Sequence[Late]) -> PastState:
         step = self.state.step + 1
-        return State(step, (self.estimator.pasts.number(step, (JOINT_LOCAL,), (self._joint(heard),)),) * len(heard))
+        return PastState(step, (self.estimator.pasts.number(step, (JOINT_LOCAL,), (self._joint(heard),)),) * len(heard))

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from stochfuse.errors import UsageError
-from stochfuse.estimators.recursion import RecursiveEstimator, Rule, Worked
+from stochfuse.estimators.recursion import FusionStep, RecursiveEstimator, Worked
 from stochfuse.fusion.equivalent_measurement import (
     Equivalent,
     actual_error,
@@ -35,7 +35,7 @@ class EquivalentMeasurement(RecursiveEstimator):
     def __init__(self, world: Any, kinds: Sequence[int], relabellings: Any = None, *, errors: bool = False) -> None:
         super().__init__(world, range(world.agents), None, errors=errors)
         self._fused: dict[tuple[int, tuple[int, ...]], tuple[Equivalent, np.ndarray]] = {}
-        self._rules: dict[tuple[int, int], Rule] = {}
+        self._rules: dict[tuple[int, int], FusionStep] = {}
         varying = [each.ndim > 2 for each in (*world.R, *world.H)]
         self._varies = any(varying)
         self._sees = [i for i in range(world.agents) if world.H[i].any()]
@@ -69,7 +69,7 @@ class EquivalentMeasurement(RecursiveEstimator):
         b = np.zeros((P.shape[-1], 1)) if self.world.error is None else self.world.error[rows]
         return Worked(P, actual=P, bias=b[None])
 
-    def work(self, step: int, rules: Sequence[Rule], rests_on: list[Worked]) -> Worked:
+    def work(self, step: int, rules: Sequence[FusionStep], rests_on: list[Worked]) -> Worked:
         """Time update and one measurement."""
         _, agent, *members = rules[0]
         (before,), rows = rests_on, self.world.states[agent]

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from stochfuse.errors import UsageError
-from stochfuse.estimators.recursion import RecursiveEstimator, Rule, Worked
+from stochfuse.estimators.recursion import FusionStep, RecursiveEstimator, Worked
 from stochfuse.estimators.world import World
 from stochfuse.fusion.intersection import Criterion, Stack, fuse_stack
 
@@ -57,7 +57,7 @@ class SplitCovarianceIntersection(RecursiveEstimator):
             return self.pasts.number(step, (RELATED, agent, *others), [values[j] for j in (agent, *others)])
         return self.pasts.number(step, (TOGETHER,), [values[agent], *(values[j] for j in others), *due])
 
-    def work(self, step: int, rules: Sequence[Rule], rests_on: list[Worked]) -> Worked:
+    def work(self, step: int, rules: Sequence[FusionStep], rests_on: list[Worked]) -> Worked:
         """Fuse a batch with the weights that are best for each."""
         split = [self._split(each) for each in rests_on]
         known, independent = [c for c, _ in split], [i for _, i in split]

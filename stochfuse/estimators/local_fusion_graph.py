@@ -38,7 +38,7 @@ class Agent(NamedTuple):
     known: int
 
 
-class State(NamedTuple):
+class GraphState(NamedTuple):
     """What is known before an exchange.
 
     Parameters
@@ -111,14 +111,14 @@ class LocalFusionGraph(FusionRule):
 
     removes, additive = True, True
 
-    def start(self) -> State:
+    def start(self) -> GraphState:
         """Everyone's initial estimate; a shared one is a common ancestor of all."""
         if self.shared:
             root = self.ledger.start(COMMON)
-            return State(((root, 1),), tuple(Agent(root, 1) for _ in self.sources))
-        return State((), tuple(Agent(self.ledger.start(source), 0) for source in self.sources))
+            return GraphState(((root, 1),), tuple(Agent(root, 1) for _ in self.sources))
+        return GraphState((), tuple(Agent(self.ledger.start(source), 0) for source in self.sources))
 
-    def exchange(self, state: State) -> GraphExchange:
+    def exchange(self, state: GraphState) -> GraphExchange:
         """Open the exchange of the state's step."""
         values, below = [value for value, _ in state.nodes], [below for _, below in state.nodes]
         return GraphExchange(self, Pedigrees(self.ledger, values, below), state.agents, state.late)
@@ -181,7 +181,7 @@ class GraphExchange:
             self._unions[heard] = known
         return known
 
-    def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[State, tuple[int, ...]]:
+    def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[GraphState, tuple[int, ...]]:
         """State before the next exchange, in the order that like states share, and the agent at each place of it."""
         return self._merged(*self._next(heard, late))
 
@@ -204,7 +204,9 @@ class GraphExchange:
                     waiting[receiver, left] = waiting.get((receiver, left), 0) | mask
         return agents, waiting
 
-    def _merged(self, agents: Sequence[Agent], waiting: dict[tuple[int, int], int]) -> tuple[State, tuple[int, ...]]:
+    def _merged(
+        self, agents: Sequence[Agent], waiting: dict[tuple[int, int], int]
+    ) -> tuple[GraphState, tuple[int, ...]]:
         kept = self._reachable([agent.known for agent in agents], list(waiting.values()))
         nodes = [node for node in range(kept.bit_length()) if kept >> node & 1]
         ledger, n = self.estimator.ledger, len(agents)
@@ -227,7 +229,7 @@ class GraphExchange:
             (ledger.invariant(agent.value), sorted(theirs[i]), sorted(left for r, left in waiting if r == i))
             for i, agent in enumerate(agents)
         ]
-        best: tuple[State, tuple[int, ...]] | None = None
+        best: tuple[GraphState, tuple[int, ...]] | None = None
         for order in best_relabelling(invariants, self.estimator.relabellings):
             bit, place_of = [0] * n, [0] * n
             for place, i in enumerate(order):
@@ -240,7 +242,7 @@ class GraphExchange:
                 ]
             sequence = _sequence(keys, nodes, below)
             new = {nodes[p]: 1 << place for place, p in enumerate(sequence)}
-            state = State(
+            state = GraphState(
                 tuple([(moved(values[nodes[p]], order), _moved(below[nodes[p]] & kept, new)) for p in sequence]),
                 tuple([Agent(moved(agents[i].value, order), _moved(agents[i].known & kept, new)) for i in order]),
                 tuple(sorted((place_of[r], left, _moved(m & kept, new)) for (r, left), m in waiting.items())),

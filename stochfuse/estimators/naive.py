@@ -15,7 +15,7 @@ from stochfuse.estimators.ledger import COMMON
 from stochfuse.estimators.protocol import FusionRule, Late, in_least_order
 
 
-class State(NamedTuple):
+class NaiveState(NamedTuple):
     """Before an exchange: the agents' local estimates, and (receiver, steps left, estimate) of messages under way."""
 
     agents: tuple[int, ...]
@@ -27,11 +27,11 @@ class NaiveFusion(FusionRule):
 
     removes, additive = False, True
 
-    def start(self) -> State:
+    def start(self) -> NaiveState:
         """Everyone's initial estimate."""
-        return State(tuple(self.ledger.start(COMMON if self.shared else source) for source in self.sources))
+        return NaiveState(tuple(self.ledger.start(COMMON if self.shared else source) for source in self.sources))
 
-    def exchange(self, state: State) -> NaiveExchange:
+    def exchange(self, state: NaiveState) -> NaiveExchange:
         """Open the exchange of the state's step."""
         return NaiveExchange(self, state)
 
@@ -39,7 +39,7 @@ class NaiveFusion(FusionRule):
 class NaiveExchange:
     """One exchange."""
 
-    def __init__(self, estimator: NaiveFusion, state: State) -> None:
+    def __init__(self, estimator: NaiveFusion, state: NaiveState) -> None:
         self.estimator, self.state = estimator, state
         self._step = estimator.ledger.step[state.agents[0]]
         self._due: list[list[int]] = [[] for _ in state.agents]
@@ -67,16 +67,16 @@ class NaiveExchange:
         terms = [(self.union(heard[agent]), 1), *((value, 1) for value in self._due[agent])]
         return self.estimator.ledger.combine(self._step, terms)
 
-    def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[State, tuple[int, ...]]:
+    def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[NaiveState, tuple[int, ...]]:
         """State before the next exchange, in the order that like states share, and the agent at each place of it."""
         estimator = self.estimator
         agents, under_way, order = in_least_order(estimator.ledger, *self._next(heard, late), estimator.relabellings)
-        return State(agents, under_way), order
+        return NaiveState(agents, under_way), order
 
     def onward(self, heard: Sequence[int], late: Sequence[Late] = ()) -> NaiveExchange:
         """Open the next exchange as it comes."""
         agents, under_way = self._next(heard, late)
-        return NaiveExchange(self.estimator, State(tuple(agents), tuple(under_way)))
+        return NaiveExchange(self.estimator, NaiveState(tuple(agents), tuple(under_way)))
 
     def _next(self, heard: Sequence[int], late: Sequence[Late]) -> tuple[list[int], list[tuple[int, int, int]]]:
         ledger, sources = self.estimator.ledger, self.estimator.sources

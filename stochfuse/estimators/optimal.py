@@ -20,7 +20,7 @@ Held = tuple[int, ...]
 """Agents whose measurement of step 1, 2, … is held, as masks."""
 
 
-class State(NamedTuple):
+class KnownSets(NamedTuple):
     """Before an exchange: what every agent holds, and (receiver, steps left, held) of messages under way."""
 
     agents: tuple[Held, ...]
@@ -36,11 +36,11 @@ class OptimalFusion(FusionRule):
         super().__init__(ledger, sources, **more)
         self._values: dict[Held, int] = {}
 
-    def start(self) -> State:
+    def start(self) -> KnownSets:
         """Everyone's initial estimate."""
-        return State(tuple((1 << i,) for i in range(len(self.sources))))
+        return KnownSets(tuple((1 << i,) for i in range(len(self.sources))))
 
-    def exchange(self, state: State) -> OptimalExchange:
+    def exchange(self, state: KnownSets) -> OptimalExchange:
         """Open the exchange of the state's step."""
         return OptimalExchange(self, state)
 
@@ -63,7 +63,7 @@ class OptimalFusion(FusionRule):
 class OptimalExchange:
     """One exchange."""
 
-    def __init__(self, estimator: OptimalFusion, state: State) -> None:
+    def __init__(self, estimator: OptimalFusion, state: KnownSets) -> None:
         self.estimator, self.state = estimator, state
         self._due: list[list[Held]] = [[] for _ in state.agents]
         for receiver, left, held in state.late:
@@ -83,7 +83,7 @@ class OptimalExchange:
         """Value that an agent would claim after hearing some agents, with what else is due."""
         return self.estimator.value(self.held(agent, heard[agent]))
 
-    def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[State, tuple[int, ...]]:
+    def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[KnownSets, tuple[int, ...]]:
         """State before the next exchange, in the order that like states share, and the agent at each place of it."""
         state = self._next(heard, late)
         counts = [tuple(mask.bit_count() for mask in held) for held in state.agents]
@@ -93,18 +93,18 @@ class OptimalExchange:
         """Open the next exchange as it comes."""
         return OptimalExchange(self.estimator, self._next(heard, late))
 
-    def _next(self, heard: Sequence[int], late: Sequence[Late]) -> State:
+    def _next(self, heard: Sequence[int], late: Sequence[Late]) -> KnownSets:
         under_way = [(r, left - 1, held) for r, left, held in self.state.late if left > 0]
         under_way += [(m.receiver, m.delay - 1, self.state.agents[m.sender]) for m in late]
         agents = tuple((*self.held(i, h), 1 << i) for i, h in enumerate(heard))
-        return State(agents, tuple(sorted(under_way)))
+        return KnownSets(agents, tuple(sorted(under_way)))
 
 
-def _moved(state: State, order: tuple[int, ...]) -> State:
+def _moved(state: KnownSets, order: tuple[int, ...]) -> KnownSets:
     place = {agent: p for p, agent in enumerate(order)}
 
     def moved(held: Held) -> Held:
         return tuple(sum(1 << p for i, p in place.items() if mask >> i & 1) for mask in held)
 
     late = tuple(sorted((place[r], left, moved(held)) for r, left, held in state.late))
-    return State(tuple(moved(state.agents[i]) for i in order), late)
+    return KnownSets(tuple(moved(state.agents[i]) for i in order), late)

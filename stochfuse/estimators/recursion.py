@@ -55,7 +55,7 @@ class Worked(NamedTuple):
         return Worked(self.P, actual=moments.actual, bias=moments.bias)
 
 
-class State(NamedTuple):
+class PastState(NamedTuple):
     """Before an exchange: every agent's value, and (receiver, steps left, value) of messages under way."""
 
     step: int
@@ -100,11 +100,11 @@ class RecursiveEstimator:
         """Noise footprints, where errors are carried along; large, and so not made before they are asked for."""
         return Footprints(self.world) if self.errors else None
 
-    def start(self) -> State:
+    def start(self) -> PastState:
         """Everyone's first estimate."""
-        return State(1, tuple(self.pasts.number(1, ("start", label)) for label in self.labels))
+        return PastState(1, tuple(self.pasts.number(1, ("start", label)) for label in self.labels))
 
-    def exchange(self, state: State) -> PastExchange:
+    def exchange(self, state: PastState) -> PastExchange:
         """Open the exchange of the state's step."""
         return PastExchange(self, state)
 
@@ -132,11 +132,11 @@ class RecursiveEstimator:
         """What an agent has at the next step, of what it claims now and had before the exchange."""
         return self.pasts.number(step + 1, ("local", self.labels[agent]), (fused,))
 
-    def work(self, step: int, rules: Sequence[Rule], rests_on: list[Worked]) -> Worked:
+    def work(self, step: int, rules: Sequence[FusionStep], rests_on: list[Worked]) -> Worked:
         """Work a batch out, from stacks of what it rests on; all have one rule unless its name is in `mixed`."""
         raise NotImplementedError
 
-    def batch(self, step: int, rules: Sequence[Rule], rests_on: list[Worked]) -> Worked:
+    def batch(self, step: int, rules: Sequence[FusionStep], rests_on: list[Worked]) -> Worked:
         """Work out the rules that all estimators share, and leave the others to `work`."""
         rule = rules[0]
         if rule[0] == "start":
@@ -181,7 +181,7 @@ class RecursiveEstimator:
 class PastExchange:
     """One exchange."""
 
-    def __init__(self, estimator: RecursiveEstimator, state: State) -> None:
+    def __init__(self, estimator: RecursiveEstimator, state: PastState) -> None:
         self.estimator, self.state = estimator, state
         self._fused: dict[tuple[int, int], int] = {}
         self._due: list[list[int]] = [[] for _ in state.agents]
@@ -198,18 +198,18 @@ class PastExchange:
             self._fused[agent, heard[agent]] = known
         return known
 
-    def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[State, tuple[int, ...]]:
+    def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[PastState, tuple[int, ...]]:
         """State before the next exchange, in the order that like states share, and the agent at each place of it."""
         estimator = self.estimator
         step, agents, coming = self._next(heard, late)
         agents, under_way, order = in_least_order(estimator.pasts, agents, coming, estimator.relabellings)
-        return State(step, agents, under_way), order
+        return PastState(step, agents, under_way), order
 
     def onward(self, heard: Sequence[int], late: Sequence[Late] = ()) -> PastExchange:
         """Open the next exchange as it comes."""
         return self.estimator.exchange(self._next(heard, late))
 
-    def _next(self, heard: Sequence[int], late: Sequence[Late]) -> State:
+    def _next(self, heard: Sequence[int], late: Sequence[Late]) -> PastState:
         step, before, under_way = self.state
         estimator = self.estimator
         agents = tuple(estimator.onward(step, i, self.fused(i, heard), value) for i, value in enumerate(before))
@@ -219,7 +219,7 @@ class PastExchange:
             (r, left, estimator.pasts.number(step + 1, ("forward", estimator.labels[r]), (value,)))
             for r, left, value in coming
         ]
-        return State(step + 1, agents, tuple(sorted(forward)))
+        return PastState(step + 1, agents, tuple(sorted(forward)))
 
 
 class PastClaims:
@@ -275,7 +275,9 @@ class PastClaims:
         return out
 
 
-def _worked_out(estimator: RecursiveEstimator, step: int, rules: Sequence[Rule], rests_on: list[Worked]) -> Worked:
+def _worked_out(
+    estimator: RecursiveEstimator, step: int, rules: Sequence[FusionStep], rests_on: list[Worked]
+) -> Worked:
     """Work a batch out, and see that covariances come of it."""
     mend = "expected noises R that are not negligible beside the errors P, in units in which P is not far from 1"
     try:
@@ -290,7 +292,7 @@ def _worked_out(estimator: RecursiveEstimator, step: int, rules: Sequence[Rule],
     return worked
 
 
-Rule = tuple[Any, ...]
+FusionStep = tuple[Any, ...]
 """Name of a rule, and the numbers of the agents that it concerns."""
 
 
@@ -305,13 +307,13 @@ class Pasts(Renamed):
 
     def __init__(self, symmetric: Sequence[str] = (), kinds: Sequence[int] | None = None) -> None:
         self.step: list[int] = []
-        self.rule: list[Rule] = []
+        self.rule: list[FusionStep] = []
         self.rests_on: list[tuple[int, ...]] = []
         self._symmetric = frozenset(symmetric)
-        self._number: dict[tuple[int, Rule, tuple[int, ...]], int] = {}
+        self._number: dict[tuple[int, FusionStep, tuple[int, ...]], int] = {}
         super().__init__(kinds, None if kinds is None else Pasts(symmetric))
 
-    def number(self, step: int, rule: Rule, rests_on: Sequence[int] = ()) -> int:
+    def number(self, step: int, rule: FusionStep, rests_on: Sequence[int] = ()) -> int:
         """Return the number of a past."""
         key = (step, rule, tuple(sorted(rests_on) if rule[0] in self._symmetric else rests_on))
         known = self._number.get(key)
@@ -330,7 +332,7 @@ class Pasts(Renamed):
             new = known[value] = into.number(self.step[value], (name, *(names[a] for a in agents)), rests_on)
         return new
 
-    def batches(self, mixed: Sequence[str]) -> Iterator[tuple[int, list[Rule], np.ndarray]]:
+    def batches(self, mixed: Sequence[str]) -> Iterator[tuple[int, list[FusionStep], np.ndarray]]:
         """Pasts of one step and rule that rest on as many others, and on none of their own batch; in order of time.
 
         Parameters
@@ -338,7 +340,7 @@ class Pasts(Renamed):
         mixed : names of the rules that are worked out together whatever agents they concern.
         """
         level: list[int] = []
-        found: dict[tuple[int, int, Rule, int], list[int]] = {}
+        found: dict[tuple[int, int, FusionStep, int], list[int]] = {}
         for number, (step, rule, rests_on) in enumerate(zip(self.step, self.rule, self.rests_on, strict=True)):
             level.append(1 + max((level[n] for n in rests_on if self.step[n] == step), default=-1))
             what = rule[:1] if rule[0] in mixed else rule

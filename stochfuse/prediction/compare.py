@@ -15,11 +15,11 @@ from stochfuse.kalman.metrics import Metric
 from stochfuse.prediction.predict import choose, predict
 from stochfuse.prediction.quantities import QUANTITIES
 from stochfuse.prediction.result import Prediction
-from stochfuse.scenario.registry import CHAIN, ESTIMATORS, METHODS, OPTIMAL
+from stochfuse.scenario.registry import CHAIN, ESTIMATORS, GENERAL, METHODS, MONTE_CARLO, NAIVE, OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.scenario import Scenario, link_rows
 
-DEFAULT_METHODS = ("general", "simplified", "naive", "monte-carlo")
-EXACT_FIRST = ("general", "optimal", "simplified", "naive", "monte-carlo")
+DEFAULT_METHODS = (GENERAL, SIMPLIFIED, NAIVE, MONTE_CARLO)
+EXACT_FIRST = (GENERAL, OPTIMAL, SIMPLIFIED, NAIVE, MONTE_CARLO)
 """Which method the others are compared with, if it is not said."""
 
 
@@ -89,7 +89,7 @@ def compare(
     reference = OPTIMAL if reference == CHAIN else reference
     if len(set(methods)) < len(methods):
         raise UsageError(f"methods: expected different ones, got {', '.join(methods)}")
-    if quantity == "optimal" and len(methods) > 1:
+    if quantity == OPTIMAL and len(methods) > 1:
         raise UsageError("quantity: expected one that depends on the method; the optimum is the same for all")
     if reference is None:
         reference = min(methods, key=EXACT_FIRST.index)
@@ -165,9 +165,9 @@ def compare_estimators(
     if len(set(estimators or ())) < len(estimators or ()):
         raise UsageError(f"estimator: expected different ones, got {', '.join(estimators or ())}")
     if method is not None:
-        choose("methods", method, ("general", "monte-carlo"))
+        choose("methods", method, (GENERAL, MONTE_CARLO))
     for quantity in quantities:
-        choose("quantity", quantity, tuple(q for q in QUANTITIES if q != "optimal"))
+        choose("quantity", quantity, tuple(q for q in QUANTITIES if q != OPTIMAL))
     hardest = max(quantities, key=("claimed", "actual", "consistency", "bias", "rms").index)
     found: list[Prediction] = []
     left_out: dict[str, list[str]] = {}
@@ -193,8 +193,8 @@ def _estimated(
     network = scenario.network
     exchange = len(events(network, link_rows(scenario, link), 1)) * log2(len(network.delay) + 1)
     if {"runs", "seed", "workers"} & set(settings) or exchange > EASY_EXCHANGE:
-        return predict(scenario, link, "monte-carlo", quantity, estimator=estimator, **settings)
+        return predict(scenario, link, MONTE_CARLO, quantity, estimator=estimator, **settings)
     try:
-        return predict(scenario, link, "general", quantity, estimator=estimator, **easy)
+        return predict(scenario, link, GENERAL, quantity, estimator=estimator, **easy)
     except TooManyError:
-        return predict(scenario, link, "monte-carlo", quantity, estimator=estimator, **settings)
+        return predict(scenario, link, MONTE_CARLO, quantity, estimator=estimator, **settings)

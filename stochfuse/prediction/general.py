@@ -498,15 +498,23 @@ def outcomes(
     UsageError
         If the outcomes are too many, or a covariance has no inverse.
     """
-    if links.common(system.network) is None or plain or how.prune or records is not None:
+    if _common(system, links) is None or plain or how.prune or records is not None:
         found = _enumerated(system, links, how, records=records, errors=errors, plain=plain)
     else:
-        found = _kept(_Asked.of(system, how, errors))
+        found = _kept(_Structure.of(system, how, errors))
     return Outcomes(system, links, found, errors, records)
 
 
+def _common(system: System, links: LinkRows) -> np.ndarray | None:
+    """Probability that all links have in common; None too where masked links are certain: one outcome is possible."""
+    common = links.common(system.network)
+    if common is None or (not links.uniform and np.isin(common, (0.0, 1.0)).all()):
+        return None
+    return common
+
+
 @dataclass(frozen=True)
-class _Asked:
+class _Structure:
     """All that outcomes under one µ depend on; equal where that is.
 
     Parameters
@@ -521,7 +529,7 @@ class _Asked:
     how: Settings = field(compare=False)
 
     @classmethod
-    def of(cls, system: System, how: Settings, errors: bool) -> _Asked:
+    def of(cls, system: System, how: Settings, errors: bool) -> _Structure:
         estimator = (how.estimator, how.max_graphs, how.criterion)
         # what is not a sum of information may look at numbers of the system while it writes down pasts
         own = () if how.estimator in SUMS else (id(system),)
@@ -529,7 +537,7 @@ class _Asked:
 
 
 @lru_cache(maxsize=KEPT)
-def _kept(asked: _Asked) -> Enumerated:
+def _kept(asked: _Structure) -> Enumerated:
     network = asked.system.network
     return _enumerated(asked.system, restricted(uniform_rows([0.5]), network), asked.how, errors=asked.errors)
 
@@ -562,7 +570,7 @@ def _enumerated(
     per_step = [events(network, links, step) for step in range(1, network.steps + 1)]
     if links.bursts is not None:
         weights = bursty(per_step[0], len(links.link))
-    elif how.prune or links.common(network) is None:
+    elif how.prune or _common(system, links) is None:
         weights = Rows(len(links.link))
     else:
         weights = weights_for(network, sum(map(len, per_step)))
@@ -587,7 +595,7 @@ def _over_items(system: System, link: np.ndarray, items: Items, how: Settings, e
     noises = items.noises._replace(P0=np.broadcast_to(P0, (len(items), *system.P0.shape)))
     # the system's own first covariance is not used, and may be one that has no inverse
     plain = system.with_noises(Noises(P0=np.eye(system.dimension)))
-    found = _kept(_Asked.of(plain, how, errors))
+    found = _kept(_Structure.of(plain, how, errors))
     batch = _Batch(system, found, errors)
     # items with the same noises side by side, so that a block of them has few different ones
     order = np.argsort(noises.different()[1], kind="stable")

@@ -14,6 +14,7 @@ import numpy as np
 
 from stochfuse.kalman.checks import covariance_fault, first_fault
 from stochfuse.kalman.metrics import Moments
+from stochfuse.scenario.registry import LFG
 
 if TYPE_CHECKING:
     from stochfuse.prediction.general import Outcomes
@@ -38,7 +39,7 @@ class Settings:
         in each fusion by itself: over several steps that need not be the least.
     """
 
-    estimator: str = "local-fusion-graph"
+    estimator: str = LFG
     max_graphs: int = MOST_GRAPHS
     prune: bool = False
     runs: int = RUNS

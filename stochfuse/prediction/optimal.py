@@ -15,7 +15,7 @@ import numpy as np
 from stochfuse.engines.contact_chain import (
     Chain,
     Contacts,
-    Filter,
+    LosslessFilter,
     TooManyPathsError,
     by_counts,
     check_size,
@@ -89,7 +89,7 @@ def _every_path(system: System, items: Items, chain: Contacts, paths: int | None
     blocks = [np.arange(first, min(first + size, len(items))) for first in range(0, len(items), size)]
 
     def block(some: np.ndarray) -> Chain:
-        def go(given: Filter, places: np.ndarray = some) -> Chain:
+        def go(given: LosslessFilter, places: np.ndarray = some) -> Chain:
             return joined([over_paths(given, chain, steps, places)])
 
         return _with_rounding(system, noises.take(some), go, some)
@@ -123,7 +123,7 @@ def _with_rounding(system: System, noises: Noises, go: Callable[..., Chain], pla
     return found._replace(rounding=far)
 
 
-def rounding(given: Filter, found: Chain, go: Callable[[Filter], Chain]) -> np.ndarray:
+def rounding(given: LosslessFilter, found: Chain, go: Callable[[LosslessFilter], Chain]) -> np.ndarray:
     """How far rounding may reach in each row's optimum at some step, (rows,).
 
     Parameters
@@ -148,9 +148,9 @@ def groups_of(system: System, links: LinkRows) -> tuple[tuple[int, ...], ...]:
     return groups_alike(network, links, kinds, relabellings(network, links, kinds))
 
 
-def filter_of(system: System) -> Filter:
+def filter_of(system: System) -> LosslessFilter:
     """Return the filter of an agent that loses nothing."""
-    return Filter(system.model, system.sensors, system.P0, system.shared, system.error)
+    return LosslessFilter(system.model, system.sensors, system.P0, system.shared, system.error)
 
 
 def counted(system: System, links: LinkRows) -> bool:
@@ -166,7 +166,7 @@ def _paths_of(system: System, chain: Contacts) -> int:
     """How many paths the chain has, followed with the simplest of filters for one row."""
     one = np.ones((1, 1))
     sensors = [Sensor(one, one)] * len(set(system.sensor_of))
-    simplest = Filter(Model(one, one, 0 * one, ("x",), ("",)), sensors, one, False)
+    simplest = LosslessFilter(Model(one, one, 0 * one, ("x",), ("",)), sensors, one, False)
     return over_paths(simplest, chain, system.steps, slice(0, 1))[1]
 
 

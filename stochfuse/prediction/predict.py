@@ -24,18 +24,28 @@ from stochfuse.prediction.quantities import QUANTITIES
 from stochfuse.prediction.result import Prediction
 from stochfuse.scenario import capabilities, registry
 from stochfuse.scenario.network import LinkRows
-from stochfuse.scenario.registry import CRITERIA, ESTIMATORS, METHODS, NATURES
+from stochfuse.scenario.registry import (
+    CRITERIA,
+    ESTIMATORS,
+    GENERAL,
+    LFG,
+    METHODS,
+    MONTE_CARLO,
+    NAIVE,
+    NATURES,
+    OPTIMAL,
+    SIMPLIFIED,
+)
 from stochfuse.scenario.scenario import Scenario, link_rows
 from stochfuse.scenario.system import Items, Noises, System
 
-LFG = "local-fusion-graph"
-NAIVE = "naive fusion counts shared information again and believes it; quantity actual is its true error"
+COUNTS_AGAIN = "naive fusion counts shared information again and believes it; quantity actual is its true error"
 CENTRE = (
     "what agents measure themselves reaches the centre of ITNS without a link, only agreement between them depends on "
     "the links: not to be compared with the optimum of what arrived"
 )
 NO_ERROR = "the scenario has no known initial error (initial.error): the bias is 0, the RMS error that of the noise"
-HARDNESS = ("claimed", "optimal", "actual", "consistency", "bias", "rms")
+HARDNESS = ("claimed", OPTIMAL, "actual", "consistency", "bias", "rms")
 """The moments of the actual error contain what is claimed; bias and rms have more to note."""
 WORTHLESS = 1e-3
 """Relative rounding beyond which it is no answer."""
@@ -92,7 +102,7 @@ def predict(
     ):
         return _by_any(scenario, link, quantity, settings)
     method, how = _asked(scenario, method, quantity, settings)
-    if steady and method != "simplified":
+    if steady and method != SIMPLIFIED:
         raise UsageError(f"steady: expected method simplified, got {method}")
     if steady and quantity != "claimed":
         raise UsageError(f"steady: expected quantity claimed, got {quantity}")
@@ -120,7 +130,7 @@ def predict_several(
     if method is None and settings.get("estimator") is None:
         method = registry.SIMPLIFIED
     together, apart = _together(method or "", quantities)
-    if method == registry.OPTIMAL and {"claimed", "optimal"} <= set(together):
+    if method == registry.OPTIMAL and {"claimed", OPTIMAL} <= set(together):
         raise UsageError(
             "quantity: with method optimal the claimed covariance is the optimal one; expected one of them"
         )
@@ -214,7 +224,7 @@ def predict_items(
         predictions |= {q: first if q == hardest else first.shown_as(q) for q in some}
         lost = {int(i): told(found.rounding[i]) for i in np.flatnonzero(found.rounding > WORTHLESS)}
         # the mean field looks for faults itself, at a fraction of the cost
-        wrong = {} if way == "simplified" else faults_of(found.moments)
+        wrong = {} if way == SIMPLIFIED else faults_of(found.moments)
         faults |= {**wrong, **lost, **found.faults}
         natures.append(found.natures)
     worst = natures[0]
@@ -293,9 +303,9 @@ def _asked(scenario: Scenario, method: str | None, quantity: str, settings: Mapp
     how = Settings(**{"estimator": scenario.estimator or LFG, "runs": scenario.runs or RUNS, **settings})
     choose("estimator", how.estimator, ESTIMATORS)
     choose("criterion", how.criterion, CRITERIA)
-    if quantity == "optimal":
-        method, how = ("monte-carlo" if method == "monte-carlo" else "optimal"), replace(how, estimator="optimal")
-    return method, replace(how, estimator="naive") if method == "naive" else how
+    if quantity == OPTIMAL:
+        method, how = (MONTE_CARLO if method == MONTE_CARLO else OPTIMAL), replace(how, estimator=OPTIMAL)
+    return method, replace(how, estimator=NAIVE) if method == NAIVE else how
 
 
 def _by_any(scenario: Scenario, link: Any, quantity: str, settings: Mapping[str, Any]) -> Prediction:
@@ -316,13 +326,13 @@ def _by_any(scenario: Scenario, link: Any, quantity: str, settings: Mapping[str,
 
 
 def _averaged(system: System, items: Items, method: str, how: Settings, quantity: str) -> Averaged:
-    errors = quantity not in ("claimed", "optimal")
+    errors = quantity not in ("claimed", OPTIMAL)
     engine = registry.engine_of(method)
     capabilities.require(system, items.links, capabilities.averaged_by(engine.name) or how.estimator, engine.name)
     found = _room(engine.file).averaged(system, items, how, errors)
-    if method == "simplified" and errors:
+    if method == SIMPLIFIED and errors:
         found = _room("states").with_errors(system, items, found)
-    first = [NAIVE] if how.estimator == "naive" and method in ("general", "naive") and not errors else []
+    first = [COUNTS_AGAIN] if how.estimator == NAIVE and method in (GENERAL, NAIVE) and not errors else []
     said = []
     if found.estimator == "itns" and not system.own:
         said.append(CENTRE)
@@ -340,7 +350,7 @@ def _prediction(scenario: Scenario, rows: LinkRows, method: str, quantity: str, 
     return Prediction(
         scenario=scenario,
         method=method,
-        quantity="optimal" if method == "optimal" and quantity == "claimed" else quantity,
+        quantity=OPTIMAL if method == OPTIMAL and quantity == "claimed" else quantity,
         stage="posterior",
         nature=next(nature for nature in reversed(NATURES) if (found.natures == nature).any()),
         link=rows.means(scenario.network),

@@ -24,13 +24,14 @@ import numpy as np
 from stochfuse.errors import UsageError
 from stochfuse.kalman.metrics import Metric, Moments
 from stochfuse.scenario import registry
+from stochfuse.scenario.registry import OPTIMAL
 
 QUANTITIES = registry.QUANTITIES
 OVERCONFIDENT = 1.05
 """Ratio of actual to claimed from which on a reader is warned."""
 
 
-_FIELD = {"claimed": "P", "optimal": "P", "actual": "actual", "consistency": "actual", "bias": "bias", "rms": "square"}
+_FIELD = {"claimed": "P", OPTIMAL: "P", "actual": "actual", "consistency": "actual", "bias": "bias", "rms": "square"}
 
 
 def matrix(quantity: str, moments: Moments) -> Any:
@@ -81,7 +82,7 @@ def linear(quantity: str, metric: Metric) -> bool:
     """Whether the number of an expectation is the expectation of the number."""
     if quantity == "bias":
         return len(metric.states) == 1
-    return metric.linear and quantity in ("claimed", "actual", "optimal")
+    return metric.linear and quantity in ("claimed", "actual", OPTIMAL)
 
 
 def title(quantity: str, stage: str) -> str:

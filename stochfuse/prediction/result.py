@@ -12,6 +12,7 @@ import stochfuse
 from stochfuse.errors import UsageError
 from stochfuse.kalman.metrics import Metric, Moments, metric
 from stochfuse.prediction.quantities import linear, matrix, number, value
+from stochfuse.scenario.registry import BROADCAST_PRIOR
 from stochfuse.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ class Prediction:
     group_of: np.ndarray
     forms: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    estimator: str = "broadcast-prior"
+    estimator: str = BROADCAST_PRIOR
     outcomes: Outcomes | None = field(default=None, repr=False)
     sampled: Sampled | None = field(default=None, repr=False)
     meta: Mapping[str, Any] = field(default_factory=dict)

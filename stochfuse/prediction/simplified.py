@@ -34,7 +34,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.engines.mean_field import Case, Outcomes, run, run_like
+from stochfuse.engines.mean_field import Case, UnlikeCase, run, run_like
 from stochfuse.engines.precision import definite, ill_noise, lost, rounding, told
 from stochfuse.errors import UsageError
 from stochfuse.kalman.algebra import NUMPY, Algebra, inverse
@@ -88,17 +88,17 @@ def _weighted(matrices: Sequence[Any], weights: Sequence[Any]) -> Any:
     return sum(terms[1:], terms[0])
 
 
-class Group(NamedTuple):
+class LikeAgents(NamedTuple):
     """Agents whose covariances are equal, and how the engine carries them.
 
     Parameters
     ----------
     agents : numbers of the agents, from 0, per column of the group.
-    case : `Case` for like agents, `Outcomes` for unlike ones.
+    case : `Case` for like agents, `UnlikeCase` for unlike ones.
     """
 
     agents: tuple[tuple[int, ...], ...]
-    case: Case | Outcomes
+    case: Case | UnlikeCase
 
     @property
     def columns(self) -> int:
@@ -233,7 +233,7 @@ def faults(P: np.ndarray) -> dict[int, str]:
     return found
 
 
-def index_of_groups(all_groups: Sequence[Group], agents: int) -> np.ndarray:
+def index_of_groups(all_groups: Sequence[LikeAgents], agents: int) -> np.ndarray:
     """Index of every agent's column among the columns of all groups, shape (agents,)."""
     index = np.zeros(agents, dtype=int)
     for column, members in enumerate(members for group in all_groups for members in group.agents):
@@ -274,14 +274,14 @@ def departures(system: System, rows: LinkRows) -> list[str]:
     return notes
 
 
-def groups(system: System, items: Items) -> list[Group]:
+def groups(system: System, items: Items) -> list[LikeAgents]:
     """Return the groups of agents that (54) has to be evaluated for."""
     network, rows = system.network, items.links
     require(system, rows, BROADCAST_PRIOR, SIMPLIFIED)
     steps = range(1, network.steps + 1)
     shared = system.shared
     if _one_case(system, rows):
-        return [Group((tuple(range(network.agents)),), like_case(system, rows, items.noises))]
+        return [LikeAgents((tuple(range(network.agents)),), like_case(system, rows, items.noises))]
     matrices = dict(zip(steps, _per_step(rows, network.steps, lambda k: rows.matrices(network, k)), strict=True))
     kinds = np.asarray(system.sensor_of)
     senders_of = possible_senders(network.architecture, network.agents)
@@ -307,7 +307,7 @@ def _group(
     own: int,
     sender_kinds: np.ndarray,
     matrices: dict[int, np.ndarray],
-) -> Group:
+) -> LikeAgents:
     """Agents with one kind of sensor, those that hear others with the same probabilities taken together."""
     kinds_here = sender_kinds[agents]
     order = np.argsort(kinds_here, axis=1, kind="stable")
@@ -330,8 +330,8 @@ def _group(
         tables = {id(h): Counts(_items(poisson_binomial(np.moveaxis(h[:, first], -1, 0)))) for h in by_step}
         arrivals = [tables[id(h)] for h in by_step]
         items = by_step[0].shape[0] * len(first)
-        return Group(members, Case(system.model, system.sensors[0], system.P0, shared, arrivals, items))
-    return Group(members, _outcomes(system, shared, own, kinds_here[first], [h[:, first] for h in by_step]))
+        return LikeAgents(members, Case(system.model, system.sensors[0], system.P0, shared, arrivals, items))
+    return LikeAgents(members, _outcomes(system, shared, own, kinds_here[first], [h[:, first] for h in by_step]))
 
 
 def _sort_within(heard: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -347,7 +347,7 @@ def _items(table: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(table.reshape(len(table), -1))
 
 
-def _outcomes(system: System, shared: bool, own: int, sender_kinds: np.ndarray, heard: list[np.ndarray]) -> Outcomes:
+def _outcomes(system: System, shared: bool, own: int, sender_kinds: np.ndarray, heard: list[np.ndarray]) -> UnlikeCase:
     """Every count of arrivals per kind of sensor; receivers of one kind may hear different numbers of each."""
     kinds = range(len(system.sensors))
     most = [int((sender_kinds == kind).sum(axis=1).max()) if sender_kinds.size else 0 for kind in kinds]
@@ -364,7 +364,7 @@ def _outcomes(system: System, shared: bool, own: int, sender_kinds: np.ndarray, 
             seen[id(h)] = _outcome_weights(h, sender_kinds, counts, kinds)
         weights.append(seen[id(h)])
     own_measurement = np.eye(len(kinds), dtype=int)[own]
-    return Outcomes(system.model, system.sensors, system.P0, shared, counts + own_measurement, weights)
+    return UnlikeCase(system.model, system.sensors, system.P0, shared, counts + own_measurement, weights)
 
 
 def _outcome_weights(heard: np.ndarray, sender_kinds: np.ndarray, counts: np.ndarray, kinds: range) -> np.ndarray:

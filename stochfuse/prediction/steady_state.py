@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stochfuse.engines.mean_field import CANCELLATION, Case, Form, MeasurementSpace, Outcomes, SquareRoot
+from stochfuse.engines.mean_field import CANCELLATION, Case, Form, MeasurementSpace, SquareRoot, UnlikeCase
 from stochfuse.engines.progress import listener
 from stochfuse.errors import NoAnswerError, UsageError
 from stochfuse.kalman.averaged_update import basis, triangle
@@ -117,7 +117,7 @@ def _require_detectable(model: Model, sensor: Sensor, P0: np.ndarray) -> None:
                 )
 
 
-def _require_bounded(case: Outcomes) -> None:
+def _require_bounded(case: UnlikeCase) -> None:
     """Raise NoAnswerError where a direction must grow, see the module's text."""
     F, Q, weights = at_step(case.model.F, 2), at_step(case.model.Q, 2), case.weights[1]
     for eigenvalue, w in _modes(F):
@@ -140,9 +140,9 @@ def _modes(F: np.ndarray) -> Iterator[tuple[complex, np.ndarray]]:
             yield (eigenvalue.real if eigenvalue.imag == 0 else eigenvalue), w
 
 
-def _apply(case: Case | Outcomes, P: np.ndarray) -> np.ndarray:
+def _apply(case: Case | UnlikeCase, P: np.ndarray) -> np.ndarray:
     """g_µ(P) for P of shape (items, d, d), in the form that its conditioning asks for."""
-    if isinstance(case, Outcomes):
+    if isinstance(case, UnlikeCase):
         return _advance(case, P)
     with np.errstate(all="ignore"):
         form = MeasurementSpace(case)
@@ -167,7 +167,7 @@ def _residual(gP: np.ndarray, P: np.ndarray) -> np.ndarray:
     return np.abs((gP - P) / _deviations(gP)).max(axis=(-2, -1))
 
 
-def _solve(case: Case | Outcomes) -> np.ndarray:
+def _solve(case: Case | UnlikeCase) -> np.ndarray:
     items = case.items
     P = np.broadcast_to(case.P0 + np.eye(len(case.P0)) * np.trace(case.P0) * 1e-3, (items, *case.P0.shape))
     steps, before = 0, np.inf
@@ -190,7 +190,7 @@ def _solve(case: Case | Outcomes) -> np.ndarray:
     )
 
 
-def _vanishing(case: Case | Outcomes, P: np.ndarray) -> np.ndarray:
+def _vanishing(case: Case | UnlikeCase, P: np.ndarray) -> np.ndarray:
     """P, and 0 where it shrinks towards it without end: where there is no process noise, 0 reproduces itself."""
     zero = np.zeros_like(P)
     start = np.diagonal(case.P0).max() + np.finfo(float).tiny
@@ -198,7 +198,7 @@ def _vanishing(case: Case | Outcomes, P: np.ndarray) -> np.ndarray:
     return np.where(gone[:, None, None], zero, P)
 
 
-def _newton(case: Case | Outcomes, P: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _newton(case: Case | UnlikeCase, P: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Newton steps as long as they help; returns the best iterate and its residual, per item."""
     gP = _apply(case, P)
     residual = _residual(gP, P)
@@ -217,7 +217,7 @@ def _newton(case: Case | Outcomes, P: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return P, residual
 
 
-def _newton_step(case: Case | Outcomes, P: np.ndarray, gP: np.ndarray) -> np.ndarray:
+def _newton_step(case: Case | UnlikeCase, P: np.ndarray, gP: np.ndarray) -> np.ndarray:
     items, d = P.shape[:2]
     rows, columns, place = triangle(d)
     unit = _deviations(P)
@@ -239,7 +239,7 @@ def _newton_step(case: Case | Outcomes, P: np.ndarray, gP: np.ndarray) -> np.nda
     return np.where(definite[:, None, None], trial, gP)
 
 
-def _certify(case: Case | Outcomes, P: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _certify(case: Case | UnlikeCase, P: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Residual, and the smallest ε for which (1−ε)P and (1+ε)P bracket the fixed point."""
     form = SquareRoot(case) if isinstance(case, Case) else case
     bound = np.where((P == 0).all(axis=(1, 2)) & (_advance(form, P) == 0).all(axis=(1, 2)), 0.0, np.inf)

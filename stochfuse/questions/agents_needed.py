@@ -24,9 +24,10 @@ from stochfuse.questions.question import (
     relative_bound,
     require_like_links,
 )
+from stochfuse.scenario.registry import OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.scenario import Scenario
 
-MOST_AGENTS = {"simplified": 1_000_000, "optimal": 100}
+MOST_AGENTS = {SIMPLIFIED: 1_000_000, OPTIMAL: 100}
 """Agents up to which each method is asked."""
 
 

@@ -35,7 +35,7 @@ from stochfuse.engines.distribution import Distribution
 from stochfuse.errors import UsageError
 from stochfuse.kalman.metrics import Metric
 from stochfuse.prediction.result import Prediction
-from stochfuse.questions.results import Results, ResultsError
+from stochfuse.questions.results import ResultsError, SimulatorResults
 
 if TYPE_CHECKING:
     from stochfuse.prediction.general import Outcomes
@@ -97,7 +97,7 @@ class Verdict(NamedTuple):
     consistency: Mapping[str, float]
 
 
-def check_results(results: Results, prediction: Prediction, metric: Metric, alpha: float = ALPHA) -> Verdict:
+def check_results(results: SimulatorResults, prediction: Prediction, metric: Metric, alpha: float = ALPHA) -> Verdict:
     """Compare a simulator's results with a prediction.
 
     Parameters
@@ -167,7 +167,7 @@ def _known(prediction: Prediction, metric: Metric) -> list[_Known | None]:
 
 
 def _cells_of_runs(
-    results: Results,
+    results: SimulatorResults,
     prediction: Prediction,
     known: Sequence[_Known | None],
     metric: Metric,
@@ -206,7 +206,7 @@ def _cells_of_runs(
 
 
 def _cells_of_means(
-    results: Results,
+    results: SimulatorResults,
     prediction: Prediction,
     known: Sequence[_Known | None],
     metric: Metric,
@@ -332,7 +332,7 @@ def _chi_squared_tail(statistic: float, freedom: int) -> float:
     return float(chdtrc(freedom, statistic))
 
 
-def _consistency(results: Results) -> dict[str, float]:
+def _consistency(results: SimulatorResults) -> dict[str, float]:
     if results.error is None:
         return {}
     out = {}

@@ -57,6 +57,7 @@ from stochfuse.questions.question import (
     require_like_links,
 )
 from stochfuse.scenario.network import number_of_senders
+from stochfuse.scenario.registry import OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.scenario import Scenario
 
 Function = Callable[[np.ndarray], np.ndarray]
@@ -175,7 +176,7 @@ def refinable(asked: Question) -> bool:
     """Whether a question is about (54) for like agents with one measurement each, and a linear metric."""
     network = asked.scenario.network
     return (
-        asked.method == "simplified"
+        asked.method == SIMPLIFIED
         and asked.step is not None
         and len(asked.scenario.sensors) == 1
         and linear(asked.quantity, asked.metric)
@@ -274,7 +275,7 @@ class LeastLink:
         return µ, self.function(µ)
 
 
-class Curve(NamedTuple):
+class Expectation(NamedTuple):
     """E(µ) with points between which it crosses a target at most once."""
 
     value: Callable[[np.ndarray], np.ndarray]
@@ -340,7 +341,7 @@ def least_link(scenario: Scenario, target: float, **asked: Any) -> LeastLink:
     )
 
 
-def _unreachable(asked: Question, target: float, curve: Curve, cells: np.ndarray) -> str:
+def _unreachable(asked: Question, target: float, curve: Expectation, cells: np.ndarray) -> str:
     points = cells
     if curve.proof != "monotone":
         points = np.unique(np.concatenate([cells, np.linspace(0.0, 1.0, LOOK)]))
@@ -356,7 +357,7 @@ def _unreachable(asked: Question, target: float, curve: Curve, cells: np.ndarray
     )
 
 
-def _relative(curve: Curve, asked: Question, bound: float) -> float:
+def _relative(curve: Expectation, asked: Question, bound: float) -> float:
     """How far values may be off: by the bound on the covariance, d times that for its determinant; or by rounding."""
     if not isfinite(bound):
         return curve.rounding
@@ -364,7 +365,7 @@ def _relative(curve: Curve, asked: Question, bound: float) -> float:
 
 
 def _enclosure(
-    curve: Curve, cells: np.ndarray, target: float, found: tuple[float, float], relative: float
+    curve: Expectation, cells: np.ndarray, target: float, found: tuple[float, float], relative: float
 ) -> tuple[float, float]:
     """Where the least µ lies if values may be wrong by so much: at that of a looser and that of a tighter target."""
     loose, tight = (
@@ -373,13 +374,13 @@ def _enclosure(
     return min(loose[0][0], found[0]), max(tight[0][0], found[0]) if tight else found[1]
 
 
-def _curve(asked: Question) -> Curve:
+def _curve(asked: Question) -> Expectation:
     if asked.monotone:
         return _monotone(asked)
     prediction = asked.predict([0.0, 1.0])
     outcomes = prediction.outcomes
     if outcomes is None:
-        return Curve(asked.at, partial(scanned, asked.at), asked.predict, "scan")
+        return Expectation(asked.at, partial(scanned, asked.at), asked.predict, "scan")
 
     def at(µ: np.ndarray) -> Prediction:
         # one enumeration answers every µ
@@ -389,14 +390,14 @@ def _curve(asked: Question) -> Curve:
     polynomials = None if asked.quantity == "bias" else prediction.polynomials(asked.metric, asked.agent)
     if polynomials is None:
         value = lambda µ: asked.read(at(µ))  # noqa: E731
-        return Curve(value, partial(scanned, value), at, "scan", rounding)
+        return Expectation(value, partial(scanned, value), at, "scan", rounding)
     A = polynomials[-1]
     L = len(A) - 1
     b = A / np.array([float(comb(L, c)) for c in range(L + 1)])
-    return Curve(lambda µ: bernstein(A, L, µ), lambda target: separated(b - target), at, "polynomial", rounding)
+    return Expectation(lambda µ: bernstein(A, L, µ), lambda target: separated(b - target), at, "polynomial", rounding)
 
 
-def _monotone(asked: Question) -> Curve:
+def _monotone(asked: Question) -> Expectation:
     ends = lambda target: np.array([0.0, 1.0])  # noqa: E731
     value, rounding, sections = asked.at, ROUNDING, SECTIONS
     if asked.step is None:
@@ -404,9 +405,9 @@ def _monotone(asked: Question) -> Curve:
         if len(asked.scenario.sensors) > 1:
             # where no steady state exists it takes long to find that out: one point at a time
             value, sections = partial(_where_steady, asked, [-1.0]), 2
-    elif asked.method == "optimal":
+    elif asked.method == OPTIMAL:
         sections = 2
-    return Curve(value, ends, asked.predict, "monotone", rounding, sections)
+    return Expectation(value, ends, asked.predict, "monotone", rounding, sections)
 
 
 def _where_steady(asked: Question, without: list[float], link: np.ndarray) -> np.ndarray:

@@ -28,10 +28,11 @@ from stochfuse.prediction.method import RUNS, SEED
 from stochfuse.prediction.predict import choose, predict
 from stochfuse.questions.message_chain import frequencies, like_agents, naive_load, sampled_loads, walked_load
 from stochfuse.scenario.network import LinkRows, require_memoryless
+from stochfuse.scenario.registry import GENERAL, LFG, MONTE_CARLO, NAIVE
 from stochfuse.scenario.scenario import Scenario, link_rows, require_one_state
 
-RULES = ("local-fusion-graph", "naive")
-METHODS = ("exact", "monte-carlo")
+RULES = (LFG, NAIVE)
+METHODS = ("exact", MONTE_CARLO)
 NUMBER_BYTES, IDENTITY_BYTES = 8, 8
 
 
@@ -142,7 +143,7 @@ class MessageLoad:
 def message_load(
     scenario: Scenario,
     link: Sequence[float] | np.ndarray | float | LinkRows | None = None,
-    rule: str = "local-fusion-graph",
+    rule: str = LFG,
     *,
     method: str = "exact",
     runs: int = RUNS,
@@ -180,11 +181,11 @@ def message_load(
     last = network.steps
     drawn = [events(network, rows, k) for k in range(1, last + 1)] if rows.varies else [events(network, rows, 1)] * last
     groups = like_agents(network, rows)
-    if method == "monte-carlo" and rule != "naive":
+    if method == MONTE_CARLO and rule != NAIVE:
         sample = sampled_loads(network.agents, drawn, len(rows.link), runs, seed)
         found = frequencies(sample, groups)
     else:
-        sample, count = None, naive_load if rule == "naive" else walked_load
+        sample, count = None, naive_load if rule == NAIVE else walked_load
         found = np.stack([count(network, rows, drawn, group[0]) for group in groups], axis=2)
     return MessageLoad(
         scenario=scenario,
@@ -283,7 +284,7 @@ def accuracy(
     """
     scenario, last = load.scenario, int(load.steps[-1])
     if method == "exact":
-        how = "naive" if load.rule == "naive" else "general"
+        how = NAIVE if load.rule == NAIVE else GENERAL
     else:
         how, settings = method, {**settings, "estimator": load.rule}
     try:

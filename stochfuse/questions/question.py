@@ -18,12 +18,12 @@ from stochfuse.prediction.predict import choose
 from stochfuse.prediction.predict import predict as predict_
 from stochfuse.prediction.quantities import noun
 from stochfuse.prediction.result import Prediction
-from stochfuse.scenario.registry import CHAIN, METHODS, OPTIMAL
+from stochfuse.scenario.registry import CHAIN, METHODS, MONTE_CARLO, OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.scenario import Scenario
 
 SLACK = 8 * np.finfo(float).eps
 """Relative rounding that is allowed for, so that a value that was printed in full is a target that can be met."""
-MONOTONE = {("simplified", "claimed"), ("simplified", "actual"), ("optimal", "claimed"), ("optimal", "optimal")}
+MONOTONE = {(SIMPLIFIED, "claimed"), (SIMPLIFIED, "actual"), (OPTIMAL, "claimed"), (OPTIMAL, OPTIMAL)}
 """Methods and quantities whose numbers are proved never to rise with µ, see `stochfuse.questions.least_link`."""
 
 
@@ -84,7 +84,7 @@ def question(
     *,
     step: int | None = None,
     steady: bool = False,
-    method: str = "simplified",
+    method: str = SIMPLIFIED,
     quantity: str = "claimed",
     of: str | None = None,
     agent: int | str = "mean",
@@ -109,14 +109,14 @@ def question(
     choose("method", method, METHODS)
     last = scenario.network.steps
     method = OPTIMAL if method == CHAIN else method
-    if method == "monte-carlo":
+    if method == MONTE_CARLO:
         raise UsageError(
             "method: expected simplified, general, optimal or naive, got monte-carlo: its values are sampled, and what "
             "is asked backwards of them would follow the sample's errors"
         )
     if steady and step is not None:
         raise UsageError(f"step: expected none with the steady state, got {step}")
-    if steady and method != "simplified":
+    if steady and method != SIMPLIFIED:
         raise UsageError(f"steady: expected method simplified, got {method}")
     if step is not None and not 1 <= step <= last:
         raise UsageError(f"step: expected a number from 1 to {last} (network.steps), got {step}")
@@ -126,8 +126,8 @@ def question(
         )
     chosen = metric(of or scenario.metric or "trace", scenario.model)
     at = None if steady else step or last
-    if quantity == "optimal" or (method, quantity) == ("optimal", "claimed"):
-        method = quantity = "optimal"  # the optimum is the same whatever the method
+    if quantity == OPTIMAL or (method, quantity) == (OPTIMAL, "claimed"):
+        method = quantity = OPTIMAL  # the optimum is the same whatever the method
     return Question(scenario.until(at or 1), at, chosen, agent, method, quantity, settings)
 
 

@@ -23,7 +23,7 @@ class ResultsError(UsageError):
 
 
 @dataclass(frozen=True, eq=False)
-class Results:
+class SimulatorResults:
     """What a simulator found.
 
     Parameters
@@ -62,7 +62,7 @@ class Results:
         return list(dict.fromkeys(self.link.tolist()))
 
 
-def read_results(source: str | Path) -> Results:
+def read_results(source: str | Path) -> SimulatorResults:
     """Read a simulator's results, CSV or JSON.
 
     Columns run, agent, step, link, covariance and optionally error, one row per run; or, already averaged, step, link,
@@ -134,7 +134,7 @@ def _from_json(name: str, text: str) -> tuple[list[str], Rows, str]:
     return header, rows, "record"
 
 
-def _checked(name: str, header: list[str], rows: Rows, what: str) -> Results:
+def _checked(name: str, header: list[str], rows: Rows, what: str) -> SimulatorResults:
     if len(set(header)) < len(header):
         raise ResultsError(f"{name}: a column is named twice: {', '.join(header)}")
     means = "count" in header
@@ -175,7 +175,7 @@ def _checked(name: str, header: list[str], rows: Rows, what: str) -> Results:
     def whole(column: str, least: int) -> np.ndarray:
         return numbers(column, "a whole number", least).astype(np.int64)
 
-    results = Results(
+    results = SimulatorResults(
         source=name,
         link=np.array([_link(cell) for cell in columns["link"]] if "link" in header else [""] * len(rows)),
         step=whole("step", 1),
@@ -221,7 +221,7 @@ def _link(cell: Any) -> str:
         return text
 
 
-def _check_different(results: Results) -> None:
+def _check_different(results: SimulatorResults) -> None:
     run = results.run if results.run is not None else np.zeros(len(results.step), dtype=np.int64)
     _, link = np.unique(results.link, return_inverse=True)
     order = np.lexsort((results.line, results.step, results.agent, run, link))

@@ -29,6 +29,7 @@ from stochfuse.prediction.quantities import linear
 from stochfuse.prediction.result import Prediction
 from stochfuse.questions.question import Question, described, question
 from stochfuse.scenario.network import LinkRows, uniform_rows
+from stochfuse.scenario.registry import SIMPLIFIED
 from stochfuse.scenario.scenario import Scenario
 
 MOST_AGENTS = 12
@@ -103,7 +104,7 @@ def sensitivity(
     drawn = [(event.sender, event.receivers) for event in events(network, uniform_rows([1.0]), 1)]
     µ = np.array([base[receivers[0], sender] for sender, receivers in drawn])
     alike = len(scenario.sensors) == 1 and len(set(µ)) == 1 and asked_for.agent == "mean"
-    exact = asked_for.method != "simplified" and linear(asked_for.quantity, asked_for.metric)
+    exact = asked_for.method != SIMPLIFIED and linear(asked_for.quantity, asked_for.metric)
     exact = exact and asked_for.quantity != "bias"
     varied = µ[:1] if alike else µ
     degree = asked_for.scenario.network.steps * (len(µ) if alike else 1) + SPARE if exact else SHORT_DEGREE

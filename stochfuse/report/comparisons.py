@@ -19,7 +19,7 @@ from stochfuse.kalman.metrics import Metric
 from stochfuse.prediction.compare import Comparison, EstimatorComparison
 from stochfuse.report import predictions
 from stochfuse.report.plot import COLORS, MARKERS, figure_class, spread
-from stochfuse.report.predictions import View
+from stochfuse.report.predictions import PredictionView
 from stochfuse.report.table import Table, number, to_csv, write_file
 
 SCHEMA = "stochfuse.comparison/1"
@@ -37,7 +37,7 @@ class ComparisonView:
     """
 
     comparison: Comparison
-    views: tuple[View, ...]
+    views: tuple[PredictionView, ...]
     relative: bool = False
 
     def values(self) -> np.ndarray:
@@ -245,7 +245,7 @@ class EstimatorView:
     Parameters
     ----------
     comparison : the comparison.
-    metric, agent, digits : as for `View`.
+    metric, agent, digits : as for `PredictionView`.
     quantities : one column each.
     every_step : whether the table shows every step, or only the last.
     """
@@ -258,10 +258,10 @@ class EstimatorView:
     every_step: bool = False
 
     @cached_property
-    def views(self) -> list[list[View]]:
+    def views(self) -> list[list[PredictionView]]:
         """A view of every quantity of every estimator."""
         return [
-            [View(p.shown_as(q), self.metric, self.agent, None, self.digits) for q in self.quantities]
+            [PredictionView(p.shown_as(q), self.metric, self.agent, None, self.digits) for q in self.quantities]
             for p in self.comparison.predictions
         ]
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from stochfuse import __version__
 from stochfuse.questions.crosscheck import Cell, Verdict
-from stochfuse.questions.results import Results
-from stochfuse.report.predictions import View, counted
+from stochfuse.questions.results import SimulatorResults
+from stochfuse.report.predictions import PredictionView, counted
 from stochfuse.report.table import Table, number, to_csv
 
 SCHEMA = "stochfuse.crosscheck/1"
@@ -20,8 +20,8 @@ SCHEMA = "stochfuse.crosscheck/1"
 class CrosscheckView:
     """What is shown: the results, what was expected of them, and the verdict."""
 
-    results: Results
-    view: View
+    results: SimulatorResults
+    view: PredictionView
     verdict: Verdict
 
     @property

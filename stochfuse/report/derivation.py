@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import sympy
 
 from stochfuse import __version__
+from stochfuse.scenario.registry import GENERAL, LFG, NAIVE, OPTIMAL, SIMPLIFIED
 from stochfuse.symbolic.general import GeneralForm
 from stochfuse.symbolic.simplified import FIXED, MOST_AGENTS_CLEARED, MU, SimplifiedForm
 
@@ -42,10 +43,10 @@ class Derivation(NamedTuple):
 
 def derivation(form: SimplifiedForm | GeneralForm) -> Derivation:
     """Return the formulas of a form that fit on pages."""
-    method = _METHODS[form.estimator] if isinstance(form, GeneralForm) else "simplified"
+    method = _METHODS[form.estimator] if isinstance(form, GeneralForm) else SIMPLIFIED
     facts = {
         "method": method,
-        "quantity": "optimal" if method == "optimal" else "claimed",
+        "quantity": OPTIMAL if method == OPTIMAL else "claimed",
         "agents": form.agents,
         "step": form.step,
         "symbols": ["mu", *map(str, form.symbols)],
@@ -60,7 +61,7 @@ def _agents(n: int) -> str:
     return "1 agent" if n == 1 else f"{n} like agents"
 
 
-_METHODS = {"local-fusion-graph": "general", "naive": "naive", "optimal": "optimal"}
+_METHODS = {LFG: GENERAL, NAIVE: NAIVE, OPTIMAL: OPTIMAL}
 _SYMBOLS = "mu: link probability, q, r: process and measurement noise variance, p0: variance of the initial estimates"
 
 
@@ -75,10 +76,10 @@ def _simplified_title(form: SimplifiedForm) -> str:
 
 def _general_title(form: GeneralForm) -> str:
     start = "shared" if form.shared else "independent"
-    rule = "naive fusion (42)/(43)" if form.estimator == "naive" else "the Local Fusion Graph"
+    rule = "naive fusion (42)/(43)" if form.estimator == NAIVE else "the Local Fusion Graph"
     what, quantity, exact = f"General formulation (49) of {rule}", "claimed", "every outcome"
-    if form.estimator == "optimal":
-        what, quantity, exact = "Contact chain", "optimal", "every path; the best that linear fusion can do"
+    if form.estimator == OPTIMAL:
+        what, quantity, exact = "Contact chain", OPTIMAL, "every path; the best that linear fusion can do"
     return (
         f"{what}, {_agents(form.agents)}, {form.architecture}, scalar state with F = G = H = 1, {start} initial "
         f"estimates: expected {quantity} posterior covariance P_k after step k (exact: {exact}). {_SYMBOLS}"
@@ -90,7 +91,7 @@ def _general_formulas(form: GeneralForm) -> list[Formula]:
     P_k, derivative = sympy.Symbol(f"P_{k}"), sympy.Symbol(f"dP_{k}_dmu")
     says = f"P_{k} as a polynomial in mu"
     if form.symbols:
-        reached = "reached" if form.estimator == "optimal" else "claimed"
+        reached = "reached" if form.estimator == OPTIMAL else "claimed"
         says = f"P_{k}: every covariance that can be {reached}, times the probability that it is, a polynomial in mu"
     lines = [
         Formula("closed", says, P_k, form.closed()),

@@ -20,7 +20,7 @@ SCHEMA = "stochfuse.fusion-graph/1"
 REMOVED, OWN, OTHER = "#f4b183", "#9dc3e6", "#ffffff"
 
 
-class Claimed(NamedTuple):
+class ClaimedAtNodes(NamedTuple):
     """A metric of every fused estimate's claimed covariance."""
 
     metric: Metric
@@ -37,7 +37,7 @@ def names(nodes: tuple[Node, ...]) -> str:
     return name(nodes[0]) if len(nodes) == 1 else "{" + ", ".join(map(name, nodes)) + "}"
 
 
-def to_text(explanations: list[Explanation], claimed: Claimed | None = None, width: int | None = None) -> str:
+def to_text(explanations: list[Explanation], claimed: ClaimedAtNodes | None = None, width: int | None = None) -> str:
     """Every fusion in words, one block each, wrapped to a width."""
     blocks = []
     for e in explanations:
@@ -75,7 +75,7 @@ def _lines(terms: tuple[Term, ...], indent: int) -> list[str]:
     return lines
 
 
-def to_mapping(graph: FusionGraph, explanations: list[Explanation], claimed: Claimed | None) -> dict[str, Any]:
+def to_mapping(graph: FusionGraph, explanations: list[Explanation], claimed: ClaimedAtNodes | None) -> dict[str, Any]:
     """Return an object with nodes, edges and what explains every fusion."""
     return {
         "schema": SCHEMA,

@@ -14,14 +14,15 @@ from stochfuse import __version__
 from stochfuse.kalman.metrics import Metric
 from stochfuse.questions.messages import IDENTITY_BYTES, NUMBER_BYTES, Accuracy, Bytes, MessageLoad, in_bytes
 from stochfuse.report.plot import MARKERS, figure_class, spread
-from stochfuse.report.predictions import View
+from stochfuse.report.predictions import PredictionView
 from stochfuse.report.table import Table, number, to_csv, write_file
+from stochfuse.scenario.registry import LFG, NAIVE
 
 SCHEMA = "stochfuse.messages/1"
-SHORT = {"local-fusion-graph": "LFG", "naive": "naive"}
+SHORT = {LFG: "LFG", NAIVE: NAIVE}
 RULE_TITLES = {
-    "local-fusion-graph": "Local Fusion Graph, all that is new to the receiver",
-    "naive": "naive fusion, the sender's latest node",
+    LFG: "Local Fusion Graph, all that is new to the receiver",
+    NAIVE: "naive fusion, the sender's latest node",
 }
 KINDS = ("moments", "distribution", "cdf", "accuracy")
 MOST_INSIDE = 6
@@ -128,11 +129,11 @@ class LoadView:
         runs = f"{load.sample.shape[1]:,} runs, seed {load.seed}"
         return f"{RULE_TITLES[load.rule]}; sampled, {runs}; ± one standard error"
 
-    def accuracy_view(self, accuracy: Accuracy) -> View:
+    def accuracy_view(self, accuracy: Accuracy) -> PredictionView:
         """Return a view of an accuracy's prediction, for its texts."""
         if self.metric is None:
             raise ValueError("a view of accuracies needs a metric")
-        return View(accuracy.prediction, self.metric, self.agent)
+        return PredictionView(accuracy.prediction, self.metric, self.agent)
 
 
 def load_table(view: LoadView) -> Table:

@@ -22,6 +22,7 @@ from stochfuse.prediction.quantities import unit as unit_of
 from stochfuse.prediction.result import Prediction
 from stochfuse.report.plot import MARKERS, figure_class, spread
 from stochfuse.report.table import Table, number, to_csv, to_text, write_file
+from stochfuse.scenario.registry import OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.registry import title as method_title
 
 SCHEMA = "stochfuse.prediction/1"
@@ -38,7 +39,7 @@ WIDTH_95 = 1.959963984540054
 
 
 @dataclass(frozen=True)
-class View:
+class PredictionView:
     """What of a prediction is shown.
 
     Parameters
@@ -83,7 +84,7 @@ class View:
     def overconfidence(self) -> str:
         """Return a sentence if more is claimed than is true by over 5 %, where both are known; else nothing."""
         p = self.prediction
-        if p.moments.actual is None or p.method in ("simplified", "optimal"):
+        if p.moments.actual is None or p.method in (SIMPLIFIED, OPTIMAL):
             return ""
         ratio = p.shown_as("consistency").values(self.metric, self.agent)
         if ratio.max() <= OVERCONFIDENT:
@@ -180,7 +181,7 @@ class View:
         p = self.prediction
         if p.sampled is not None:
             return f"sampled, {p.sampled.runs:,} runs, seed {p.meta['seed']}; ± one standard error"
-        if p.method == "optimal":
+        if p.method == OPTIMAL:
             nature = "exact" if p.nature == "exact" else "enclosed in proved bounds"
             return nature if p.meta["paths"] is None else f"{nature}, {counted(p.meta['paths'], 'path')}"
         if p.outcomes is None:
@@ -205,11 +206,11 @@ def _finite(values: np.ndarray) -> np.ndarray:
 
 def text_of(prediction: Prediction, of: str, agent: int | str) -> str:
     """Return the table of a prediction as text of any width."""
-    view = View(prediction, metric(of, prediction.scenario.model), agent)
+    view = PredictionView(prediction, metric(of, prediction.scenario.model), agent)
     return to_text(predict_table(view), width=None)
 
 
-def predict_table(view: View) -> Table:
+def predict_table(view: PredictionView) -> Table:
     """Return rows of link probabilities (or cases) against columns of steps."""
     p = view.prediction
     values, errors, steady = view.values(), view.errors(), view.steady()
@@ -231,7 +232,7 @@ def _uniform(p: Prediction) -> bool:
     return p.scenario.network.link is None or p.scenario.network.link.ndim == 0
 
 
-def predict_csv(view: View) -> str:
+def predict_csv(view: PredictionView) -> str:
     """One line per link probability and step, with everything that says what the value is."""
     p = view.prediction
     values, errors, steady = view.values(), view.errors(), view.steady()
@@ -251,7 +252,7 @@ def predict_csv(view: View) -> str:
     return to_csv(headings if errors is None else (*headings, "standard_error"), rows)
 
 
-def predict_json(view: View) -> dict[str, Any]:
+def predict_json(view: PredictionView) -> dict[str, Any]:
     """Return the object of schema stochfuse.prediction/1."""
     p = view.prediction
     model, steady = p.scenario.model, view.steady()
@@ -309,7 +310,7 @@ STYLES = ("-", "--", ":", "-.")
 RATIO = "actual / claimed"
 
 
-def side_table(views: Sequence[View]) -> Table:
+def side_table(views: Sequence[PredictionView]) -> Table:
     """Return rows of link probability and step, columns of quantities."""
     p = views[0].prediction
     values, errors = [view.values() for view in views], [view.errors() for view in views]
@@ -328,13 +329,13 @@ def side_table(views: Sequence[View]) -> Table:
     return Table(titles, keys, tuple(view.prediction.quantity for view in views), tuple(rows))
 
 
-def side_csv(views: Sequence[View]) -> str:
+def side_csv(views: Sequence[PredictionView]) -> str:
     """Return the records of one quantity after the other."""
     first, *others = (predict_csv(view) for view in views)
     return first + "".join(text.partition("\n")[2] for text in others)
 
 
-def side_json(views: Sequence[View]) -> dict[str, Any]:
+def side_json(views: Sequence[PredictionView]) -> dict[str, Any]:
     """Return the object of the first quantity, with all of them under `quantities`."""
     each = {view.prediction.quantity: predict_json(view) for view in views}
     kept = ("values", "standard_error", "interval", "bernstein")
@@ -350,13 +351,13 @@ def side_json(views: Sequence[View]) -> dict[str, Any]:
     }
 
 
-def plot_side(views: Sequence[View], output: Path) -> None:
+def plot_side(views: Sequence[PredictionView], output: Path) -> None:
     """Draw the quantities against link probability, colour by step, or against the step where there is one row."""
     figure = draw_side(views)
     write_file(output, lambda path: figure.savefig(path, dpi=150))
 
 
-def draw_side(views: Sequence[View]):
+def draw_side(views: Sequence[PredictionView]):
     """Return the figure, one panel for each unit."""
     from matplotlib import colormaps
     from matplotlib.lines import Line2D
@@ -401,11 +402,11 @@ def draw_side(views: Sequence[View]):
     return figure
 
 
-def _axis(view: View) -> str:
+def _axis(view: PredictionView) -> str:
     return RATIO if view.prediction.quantity == "consistency" else view.axis
 
 
-def plot_prediction(view: View, output: Path) -> None:
+def plot_prediction(view: PredictionView, output: Path) -> None:
     """Draw the values against link probability, one curve per step, or against the step where rows are cases.
 
     Raises
@@ -417,7 +418,7 @@ def plot_prediction(view: View, output: Path) -> None:
     write_file(output, lambda path: figure.savefig(path, dpi=150))
 
 
-def draw(view: View):
+def draw(view: PredictionView):
     """Return the figure, not shown and not registered with pyplot."""
     Figure = figure_class()
     from matplotlib.ticker import MaxNLocator

@@ -23,7 +23,7 @@ MEANING = (
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class DrawnCurve:
     """One curve of a panel.
 
     Parameters
@@ -66,7 +66,7 @@ class Panel:
     y_label: str
     points: tuple[str, ...]
     x: np.ndarray
-    curves: tuple[Curve, ...]
+    curves: tuple[DrawnCurve, ...]
     y_range: tuple[float, float] | None = None
     bars: bool = False
 

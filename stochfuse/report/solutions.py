@@ -20,7 +20,7 @@ from stochfuse.questions.least_link import BESIDE, LeastLink
 from stochfuse.questions.question import Question, described, named
 from stochfuse.questions.sensitivity import Sensitivity, ShareOfGain
 from stochfuse.report.plot import MARKERS, figure_class, spread
-from stochfuse.report.predictions import View
+from stochfuse.report.predictions import PredictionView
 from stochfuse.report.table import Table, number, to_csv, write_file
 
 SCHEMA = "stochfuse.solution/1"
@@ -34,7 +34,7 @@ PROOFS = {
 
 
 @dataclass(frozen=True)
-class Sheet:
+class SolutionSheet:
     """An answer, ready to be written in any format.
 
     Parameters
@@ -59,9 +59,9 @@ class Sheet:
     facts: dict[str, Any]
 
     @property
-    def view(self) -> View:
+    def view(self) -> PredictionView:
         """View of the prediction."""
-        return View(self.prediction, self.question.metric, self.question.agent)
+        return PredictionView(self.prediction, self.question.metric, self.question.agent)
 
     @property
     def titles(self) -> tuple[str, ...]:
@@ -70,12 +70,12 @@ class Sheet:
         return (*self.answer, self.view.what + when, self.view.whom, self.view.how)
 
 
-def solution_table(sheet: Sheet) -> Table:
+def solution_table(sheet: SolutionSheet) -> Table:
     """Return the answer's table under what it means."""
     return Table(sheet.titles, sheet.keys, sheet.columns, sheet.rows)
 
 
-def solution_csv(sheet: Sheet) -> str:
+def solution_csv(sheet: SolutionSheet) -> str:
     """One line per number asked for, with everything that says what it is."""
     p, asked = sheet.prediction, sheet.question
     labels = ("question", "method", "quantity", "stage", "nature", "metric", "unit", "agent")
@@ -83,7 +83,7 @@ def solution_csv(sheet: Sheet) -> str:
     return to_csv((*labels, *sheet.headings), [(*label, *record) for record in sheet.records])
 
 
-def solution_json(sheet: Sheet) -> dict[str, Any]:
+def solution_json(sheet: SolutionSheet) -> dict[str, Any]:
     """Return the object of schema stochfuse.solution/1."""
     p, asked = sheet.prediction, sheet.question
     return {
@@ -107,7 +107,7 @@ def solution_json(sheet: Sheet) -> dict[str, Any]:
     }
 
 
-def least_link_sheet(found: LeastLink, digits: int = 5) -> Sheet:
+def least_link_sheet(found: LeastLink, digits: int = 5) -> SolutionSheet:
     """Say the least link probability, its neighbours, and what can be reached at all."""
     asked, µ = found.question, found.link
     low, high = found.enclosure
@@ -150,7 +150,7 @@ def least_link_sheet(found: LeastLink, digits: int = 5) -> Sheet:
     }
     headings = ("step", "target", "link", "link_low", "link_high", "value", "value_at_0", "value_at_1", "share_of_gain")
     record = (_step(asked), found.target, µ, low, high, found.value, _blank(zero), _blank(one), _blank(found.share))
-    return Sheet(
+    return SolutionSheet(
         "least-link",
         asked,
         found.prediction,
@@ -164,7 +164,7 @@ def least_link_sheet(found: LeastLink, digits: int = 5) -> Sheet:
     )
 
 
-def agents_sheet(found: AgentsNeeded, digits: int = 5) -> Sheet:
+def agents_sheet(found: AgentsNeeded, digits: int = 5) -> SolutionSheet:
     """Say the least number of agents, and that one fewer misses the target."""
     asked, n = found.question, found.agents
     answer = (
@@ -187,7 +187,7 @@ def agents_sheet(found: AgentsNeeded, digits: int = 5) -> Sheet:
     headings = ("step", "target", "link", "agents", "value", "value_with_one_fewer")
     record = (_step(asked), found.target, found.link, n, found.value, _blank(found.fewer))
     columns = ("value", f"target {found.target:.9g}")
-    return Sheet(
+    return SolutionSheet(
         "agents-needed", asked, found.prediction, answer, ("agents",), columns, rows, headings, (record,), facts
     )
 
@@ -196,7 +196,7 @@ IMPROVEMENT = 0.01
 """How much better a link is taken to become, for an example."""
 
 
-def sensitivity_sheet(found: Sensitivity, digits: int = 5) -> Sheet:
+def sensitivity_sheet(found: Sensitivity, digits: int = 5) -> SolutionSheet:
     """Rank the links, and say which to improve first."""
     asked = found.question
     how = "exact derivatives of a polynomial in each link's µ" if found.exact else "numerical derivatives"
@@ -228,7 +228,7 @@ def sensitivity_sheet(found: Sensitivity, digits: int = 5) -> Sheet:
     }
     columns = ("µ", "d value / dµ", f"µ + {IMPROVEMENT:g}")
     headings = ("step", "rank", "sender", "receiver", "link", "derivative", "estimated_error", "value")
-    return Sheet(
+    return SolutionSheet(
         "sensitivity",
         asked,
         found.prediction,
@@ -272,7 +272,7 @@ def _advice(found: Sensitivity) -> Sequence[str]:
     return (f"Improve first: {which}; +{IMPROVEMENT:g} there lowers the value by {worth}",)
 
 
-def gain_sheet(found: ShareOfGain, digits: int = 5) -> Sheet:
+def gain_sheet(found: ShareOfGain, digits: int = 5) -> SolutionSheet:
     """Tabulate which share of the way from µ = 0 to µ = 1 each row has gone."""
     asked, p = found.question, found.prediction
     steps = ["steady"] if found.steps is None else [int(k) for k in found.steps]
@@ -302,10 +302,10 @@ def gain_sheet(found: ShareOfGain, digits: int = 5) -> Sheet:
     }
     keys = ("µ",) if p.cases is None else ("links", "mean µ")
     headings = ("case", "link", "step", "share_of_gain", "value")
-    return Sheet("gain", asked, p, tuple(answer), keys, columns, tuple(rows), headings, tuple(records), facts)
+    return SolutionSheet("gain", asked, p, tuple(answer), keys, columns, tuple(rows), headings, tuple(records), facts)
 
 
-def steady_sheet(asked: Question, prediction: Prediction, digits: int = 5) -> Sheet:
+def steady_sheet(asked: Question, prediction: Prediction, digits: int = 5) -> SolutionSheet:
     """Tabulate the steady state against link probability, with its proved bound."""
     p, values = prediction, asked.read(prediction)
     bounds = np.full(len(values), np.inf) if p.steady_bound is None else p.steady_bound.max(axis=1)
@@ -324,7 +324,9 @@ def steady_sheet(asked: Question, prediction: Prediction, digits: int = 5) -> Sh
     }
     keys = ("µ",) if p.cases is None else ("links", "mean µ")
     headings = ("case", "link", "step", "value", "relative_bound")
-    return Sheet("steady", asked, p, answer, keys, ("steady", "bound"), tuple(rows), headings, tuple(records), facts)
+    return SolutionSheet(
+        "steady", asked, p, answer, keys, ("steady", "bound"), tuple(rows), headings, tuple(records), facts
+    )
 
 
 def _bounded(bound: float) -> str:
@@ -344,7 +346,7 @@ def _blank(value: float | None) -> float | str:
 MOST_BARS = 12
 
 
-def plot_solution(sheet: Sheet, found: Any, output: Path) -> None:
+def plot_solution(sheet: SolutionSheet, found: Any, output: Path) -> None:
     """Draw an answer.
 
     Raises
@@ -356,7 +358,7 @@ def plot_solution(sheet: Sheet, found: Any, output: Path) -> None:
     write_file(output, lambda path: figure.savefig(path, dpi=150))
 
 
-def draw(sheet: Sheet, found: Any) -> Any:
+def draw(sheet: SolutionSheet, found: Any) -> Any:
     """Return the figure of an answer under what it means."""
     figure = figure_class()(figsize=(7.5, 5.4), layout="constrained")
     axes = figure.add_subplot()
@@ -374,12 +376,12 @@ def draw(sheet: Sheet, found: Any) -> Any:
     return figure
 
 
-def _label(sheet: Sheet) -> str:
+def _label(sheet: SolutionSheet) -> str:
     unit = f" [{sheet.view.unit}]" if sheet.view.unit else ""
     return f"{named(sheet.question).partition(' (')[0]}{unit}"
 
 
-def _draw_least_link(axes: Any, sheet: Sheet, found: LeastLink) -> None:
+def _draw_least_link(axes: Any, sheet: SolutionSheet, found: LeastLink) -> None:
     µ, values = found.curve()
     axes.plot(µ, values, color="C0", label=f"value, {sheet.question.when}")
     axes.axhline(found.target, color="C3", linestyle="--", linewidth=1, label=f"target {found.target:.6g}")
@@ -391,7 +393,7 @@ def _draw_least_link(axes: Any, sheet: Sheet, found: LeastLink) -> None:
     axes.legend(fontsize="small")
 
 
-def _draw_agents(axes: Any, sheet: Sheet, found: AgentsNeeded) -> None:
+def _draw_agents(axes: Any, sheet: SolutionSheet, found: AgentsNeeded) -> None:
     axes.plot(*found.tried, "o-", color="C0", markersize=3, label=f"value at µ = {found.link:g}")
     axes.axhline(found.target, color="C3", linestyle="--", linewidth=1, label=f"target {found.target:.6g}")
     axes.plot([found.agents], [found.value], "D", color="C3", label=f"{found.agents:,} agents")
@@ -402,7 +404,7 @@ def _draw_agents(axes: Any, sheet: Sheet, found: AgentsNeeded) -> None:
     axes.legend(fontsize="small")
 
 
-def _draw_sensitivity(axes: Any, sheet: Sheet, found: Sensitivity) -> None:
+def _draw_sensitivity(axes: Any, sheet: SolutionSheet, found: Sensitivity) -> None:
     label = f"d ({named(sheet.question).partition(' (')[0]}) / dµ"
     if len(found.links) <= MOST_BARS:
         order = found.order[::-1]
@@ -423,7 +425,7 @@ def _draw_sensitivity(axes: Any, sheet: Sheet, found: Sensitivity) -> None:
     axes.set_ylabel("to agent")
 
 
-def _draw_gain(axes: Any, sheet: Sheet, found: ShareOfGain) -> None:
+def _draw_gain(axes: Any, sheet: SolutionSheet, found: ShareOfGain) -> None:
     p = found.prediction
     names = ["steady"] if found.steps is None else [f"k = {k}" for k in found.steps]
     if p.cases is None:
@@ -439,7 +441,7 @@ def _draw_gain(axes: Any, sheet: Sheet, found: ShareOfGain) -> None:
     axes.legend(fontsize="small")
 
 
-def _draw_steady(axes: Any, sheet: Sheet, found: Any) -> None:
+def _draw_steady(axes: Any, sheet: SolutionSheet, found: Any) -> None:
     p, values = sheet.prediction, sheet.question.read(sheet.prediction)
     if p.cases is None:
         order = np.argsort(p.link)

@@ -16,6 +16,7 @@ import numpy as np
 from stochfuse import __version__
 from stochfuse.report.predictions import counted
 from stochfuse.report.table import Table, number, to_csv
+from stochfuse.scenario.registry import OPTIMAL
 from stochfuse.studies.pareto import ParetoFront
 from stochfuse.studies.plan import ERROR, NODES, Plan
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from stochfuse.studies.plan import Plan
 
 
-EXPECTED = ("claimed", "actual", "optimal")
+EXPECTED = ("claimed", "actual", OPTIMAL)
 """Quantities that are themselves expectations."""
 HOW = ("method", "estimator", "nature")
 """Columns that say how a point was predicted."""

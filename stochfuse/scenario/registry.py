@@ -1,6 +1,6 @@
 """What can be asked of a scenario: every estimator, engine, quantity, metric and statistic, declared once.
 
-What the agents do (`Estimator`) and how chance is averaged (`Engine`) are two choices;
+What the agents do (`EstimatorEntry`) and how chance is averaged (`EngineEntry`) are two choices;
 `stochfuse.scenario.capabilities` says which pair takes what.  Choices and help of the command line, titles, error
 messages and `stochfuse methods` are made from these entries.  It lies in this room because a scenario file's [report]
 names what is declared here.  To add an estimator: one entry here, its file in `stochfuse.estimators`, its row in the
@@ -17,7 +17,7 @@ BROADCAST_PRIOR = "broadcast-prior"
 """What the simplified formulation takes the agents to do: they share the broadcast prior and nothing else."""
 
 
-class Estimator(NamedTuple):
+class EstimatorEntry(NamedTuple):
     """What the agents do with what arrives.
 
     Parameters
@@ -46,7 +46,7 @@ class Estimator(NamedTuple):
     footprints: bool = True
 
 
-class Engine(NamedTuple):
+class EngineEntry(NamedTuple):
     """How chance is averaged.
 
     Parameters
@@ -97,7 +97,7 @@ class Measure(NamedTuple):
 
 
 ESTIMATOR = (
-    Estimator(
+    EstimatorEntry(
         LFG,
         "common information removed by the Local Fusion Graph",
         "thesis, chapter 2 and appendix A",
@@ -105,7 +105,7 @@ ESTIMATOR = (
         ("local_fusion_graph", "LocalFusionGraph"),
         sums=True,
     ),
-    Estimator(
+    EstimatorEntry(
         NAIVE,
         "estimates added up, nothing removed",
         "thesis, (42)/(43)",
@@ -113,7 +113,7 @@ ESTIMATOR = (
         ("naive", "NaiveFusion"),
         sums=True,
     ),
-    Estimator(
+    EstimatorEntry(
         OPTIMAL,
         "the best that any linear fusion could do with what arrived",
         "one filter over every measurement in the pedigree",
@@ -121,7 +121,7 @@ ESTIMATOR = (
         ("optimal", "OptimalFusion"),
         sums=True,
     ),
-    Estimator(
+    EstimatorEntry(
         "covariance-intersection",
         "everything taken for possibly correlated",
         "Julier and Uhlmann 1997",
@@ -130,7 +130,7 @@ ESTIMATOR = (
         weighs=True,
         own_states=True,
     ),
-    Estimator(
+    EstimatorEntry(
         "split-ci",
         "everything but the step's own measurement taken for possibly correlated",
         "patent on split covariance intersection",
@@ -139,7 +139,7 @@ ESTIMATOR = (
         weighs=True,
         own_states=True,
     ),
-    Estimator(
+    EstimatorEntry(
         "blender",
         "parallel filters blended in a tree, two at a time",
         "parallel filters, (19)–(30)",
@@ -147,7 +147,7 @@ ESTIMATOR = (
         ("blender", "Blender"),
         own_filters=True,
     ),
-    Estimator(
+    EstimatorEntry(
         "joint-blender",
         "parallel filters blended all at once",
         "parallel filters, least trace of all",
@@ -155,7 +155,7 @@ ESTIMATOR = (
         ("blender", "JointBlender"),
         own_filters=True,
     ),
-    Estimator(
+    EstimatorEntry(
         "equivalent-measurement",
         "measurements exchanged, their noises correlated and uncertain",
         "extended Kalman filter with uncertain fusion",
@@ -163,7 +163,7 @@ ESTIMATOR = (
         ("equivalent", "EquivalentMeasurement"),
         footprints=False,
     ),
-    Estimator(
+    EstimatorEntry(
         "independent-measurements",
         "measurements exchanged and taken for independent",
         "the same with R taken for block diagonal",
@@ -171,7 +171,7 @@ ESTIMATOR = (
         ("equivalent", "IndependentMeasurements"),
         footprints=False,
     ),
-    Estimator(
+    EstimatorEntry(
         "lwin",
         "cooperative measurements, each node for itself",
         "patent on cooperative estimators",
@@ -179,7 +179,7 @@ ESTIMATOR = (
         ("cooperative", "Lwin"),
         own_states=True,
     ),
-    Estimator(
+    EstimatorEntry(
         "itns",
         "cooperative measurements, one total covariance",
         "patent on cooperative estimators, (27)",
@@ -188,7 +188,7 @@ ESTIMATOR = (
         own_states=True,
         footprints=False,
     ),
-    Estimator(
+    EstimatorEntry(
         STAND_ALONE,
         "no fusion: every agent's own filter",
         "thesis, (23)–(27)",
@@ -198,7 +198,7 @@ ESTIMATOR = (
     ),
 )
 ENGINE = (
-    Engine(
+    EngineEntry(
         SIMPLIFIED,
         "simplified formulation (54)",
         "thesis, (50)–(54)",
@@ -206,7 +206,7 @@ ENGINE = (
         "average after every step, then go on from the average; of the broadcast prior alone",
         "simplified",
     ),
-    Engine(
+    EngineEntry(
         GENERAL,
         "general formulation (49)",
         "thesis, (44)–(49)",
@@ -214,7 +214,7 @@ ENGINE = (
         "go through every outcome of which messages arrive",
         "general",
     ),
-    Engine(
+    EngineEntry(
         CHAIN,
         "contact chain",
         "whose measurements an agent holds, walked backwards",
@@ -222,7 +222,7 @@ ENGINE = (
         "follow how many agents' measurements are held; of the optimum alone",
         "optimal",
     ),
-    Engine(
+    EngineEntry(
         MONTE_CARLO,
         "Monte Carlo",
         "sampled outcomes",
@@ -272,12 +272,12 @@ INTERSECTIONS = tuple(e.name for e in ESTIMATOR if e.weighs)
 SUMS = tuple(e.name for e in ESTIMATOR if e.sums)
 
 
-def estimator(name: str) -> Estimator:
+def estimator(name: str) -> EstimatorEntry:
     """Return the entry of an estimator."""
     return next(e for e in ESTIMATOR if e.name == name)
 
 
-def engine_of(method: str) -> Engine:
+def engine_of(method: str) -> EngineEntry:
     """Return the engine behind what --method takes."""
     name = next((s.engine for s in SHORT if s.name == method), method)
     return next(e for e in ENGINE if e.name == name)

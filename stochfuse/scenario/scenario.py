@@ -30,7 +30,7 @@ from stochfuse.kalman.metrics import metric as metric_of
 from stochfuse.scenario.checker import Checker
 from stochfuse.scenario.model import Filter, Model, Noise, Sensor
 from stochfuse.scenario.network import LinkRows, Network, default_rows, restricted, stacked_rows, uniform_rows
-from stochfuse.scenario.registry import ESTIMATORS, METHODS
+from stochfuse.scenario.registry import ESTIMATORS, GENERAL, METHODS, MONTE_CARLO
 from stochfuse.scenario.system import System
 from stochfuse.scenario.tables import read_filters, read_link, read_model, read_network, read_noise, read_sensors
 
@@ -360,11 +360,11 @@ def _report(check: Checker, table: Mapping[str, Any], model: Model | None, netwo
             check.note("report.metric", "a metric of this model", f"'{metric}' ({reason})")
     method = check.choice("report.method", table.get("method"), METHODS)
     estimator = check.choice("report.estimator", table.get("estimator"), ESTIMATORS)
-    if estimator is not None and method not in (None, "general", "monte-carlo"):
+    if estimator is not None and method not in (None, GENERAL, MONTE_CARLO):
         check.note("report.estimator", 'report.method "general" or "monte-carlo", which average it', f'"{method}"')
     runs = check.integer("report.runs", table.get("runs"), 2)
     if method is None and (estimator is not None or runs is not None):
-        method = "general" if runs is None else "monte-carlo"
+        method = GENERAL if runs is None else MONTE_CARLO
     agent = check.integer("report.agent", table.get("agent"), 1)
     if agent is not None and network is not None and agent > network.agents:
         check.note("report.agent", f"an agent from 1 to {network.agents}", str(agent))

@@ -18,7 +18,7 @@ from stochfuse.kalman.checks import shown
 Number = Annotated[int, Strict()] | Annotated[float, Strict()]
 
 
-class Table(BaseModel):
+class StrictTable(BaseModel):
     """A table: unknown keys are errors, and numbers that are not finite are left to the reading."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=True)
@@ -28,7 +28,7 @@ Whole = Annotated[int, Strict()]
 Flag = Annotated[bool, Strict()]
 
 
-class PairTable(Table):
+class PairTable(StrictTable):
     """What one pair of agents measures, in place of what all pairs measure."""
 
     agents: list[Whole] = Field(description="the observer and the other, counted from 1")
@@ -40,7 +40,7 @@ class PairTable(Table):
     both_ways: Flag = Field(True, description="whether the other measures the observer likewise, with noise of its own")
 
 
-class CooperativeTable(Table):
+class CooperativeTable(StrictTable):
     """Agents that measure each other: relative range, line-of-sight direction, or both."""
 
     positions: list[str] = Field(description="names of the 2 or 3 states that are the place")
@@ -56,7 +56,7 @@ class CooperativeTable(Table):
 Real = Annotated[float, Strict()]
 
 
-class LegTable(Table):
+class LegTable(StrictTable):
     """A part of the nominal way, with constant manoeuvre."""
 
     duration: Real = Field(description="s")
@@ -65,7 +65,7 @@ class LegTable(Table):
     climb: Real = Field(0.0, description="rate of climb at the end of the leg, reached evenly, m/s")
 
 
-class ImuTable(Table):
+class ImuTable(StrictTable):
     """The inertial measurement unit, in the units of data sheets; alike on its three axes."""
 
     angle_random_walk: Real = Field(description="white noise of the gyros, °/√h")
@@ -78,7 +78,7 @@ class ImuTable(Table):
     accelerometer_time: Real = Field(description="correlation time of the accelerometers' bias, s")
 
 
-class InitialErrorsTable(Table):
+class InitialErrorsTable(StrictTable):
     """Standard deviations of the first estimate, along north, east and down; the biases' are the IMU's."""
 
     attitude: list[Real] = Field(description="about north, about east, of the heading, °")
@@ -86,7 +86,7 @@ class InitialErrorsTable(Table):
     position: list[Real] = Field(description="m")
 
 
-class NavigationTable(Table):
+class NavigationTable(StrictTable):
     """An inertial navigation system's 15 errors along a nominal way: takes the place of F, Q and the first P."""
 
     latitude: Real = Field(description="at the start, °")
@@ -105,7 +105,7 @@ Matrix = Number | list[list[Number]] | list[list[list[Number]]]
 Link = Number | list[Number | list[Number] | list[list[Number]]]
 
 
-class ModelTable(Table):
+class ModelTable(StrictTable):
     """Linear-Gaussian model x(k) = F x(k−1) + B u + G v, z(k) = H x(k) + w, with v ~ N(0, Q), w ~ N(0, R)."""
 
     F: Matrix = Field(description="state transition, d×d; its size is the number of states")
@@ -120,7 +120,7 @@ class ModelTable(Table):
     units: list[str] | None = Field(None, description="units of the states")
 
 
-class InitialTable(Table):
+class InitialTable(StrictTable):
     """The estimates that the agents start with, at step 1."""
 
     P: Matrix = Field(description="covariance of each agent's first estimate, d×d")
@@ -131,7 +131,7 @@ class InitialTable(Table):
     error: Vector | None = Field(None, description="known initial error (bias), common to all agents")
 
 
-class BurstTable(Table):
+class BurstTable(StrictTable):
     """A bursty link (Gilbert and Elliott): good or bad, with a memory; each link on its own."""
 
     good_to_bad: Number = Field(description="probability that a good link is bad in the next step")
@@ -140,7 +140,7 @@ class BurstTable(Table):
     bad: Number = Field(0.0, description="delivery probability of a bad link")
 
 
-class CaseTable(Table):
+class CaseTable(StrictTable):
     """A named alternative to network.link."""
 
     name: str
@@ -148,7 +148,7 @@ class CaseTable(Table):
     burst: BurstTable | None = Field(None, description="as network.burst, instead of a link")
 
 
-class NetworkTable(Table):
+class NetworkTable(StrictTable):
     """Who may hear whom, and how likely."""
 
     agents: int = Field(ge=1, strict=True, description="number of agents")
@@ -169,7 +169,7 @@ class NetworkTable(Table):
     case: list[CaseTable] | None = Field(None, description="named alternatives to link, one row of the table each")
 
 
-class AgentTable(Table):
+class AgentTable(StrictTable):
     """One agent's own sensor, filter and place, where they differ from the model's."""
 
     H: Matrix | None = None
@@ -183,7 +183,7 @@ class AgentTable(Table):
     position: Vector | None = Field(None, description="nominal place for cooperative measurements, or one per step")
 
 
-class NoiseTable(Table):
+class NoiseTable(StrictTable):
     """How noises hang together that are otherwise independent."""
 
     correlation: Number | list[list[Number]] | None = Field(
@@ -199,7 +199,7 @@ class NoiseTable(Table):
     )
 
 
-class ReportTable(Table):
+class ReportTable(StrictTable):
     """How results are shown where the command does not say."""
 
     metric: str | None = Field(None, description="default metric, as --metric takes it")
@@ -211,7 +211,7 @@ class ReportTable(Table):
     agent: int | None = Field(None, ge=1, strict=True, description="whose estimate is shown; default: the mean")
 
 
-class ScenarioFile(Table):
+class ScenarioFile(StrictTable):
     """A stochfuse scenario."""
 
     model_config = ConfigDict(
@@ -273,7 +273,7 @@ def structure_problems(mapping: Any) -> list[Problem]:
 
 
 def problems_of(
-    structure: type[Table], mapping: Any, expected: Mapping[str, str] = MappingProxyType({})
+    structure: type[StrictTable], mapping: Any, expected: Mapping[str, str] = MappingProxyType({})
 ) -> list[Problem]:
     """Return every key of a parsed file that does not fit a structure, once each.
 

@@ -20,7 +20,7 @@ from stochfuse.prediction.predict import WORTHLESS, predict_items, predict_sever
 from stochfuse.prediction.result import Prediction
 from stochfuse.questions.messages import message_load
 from stochfuse.scenario.network import restricted, uniform_rows
-from stochfuse.scenario.registry import NATURES
+from stochfuse.scenario.registry import LFG, MONTE_CARLO, NAIVE, NATURES, OPTIMAL, STAND_ALONE
 from stochfuse.scenario.scenario import Scenario
 from stochfuse.scenario.system import Items, Noises
 from stochfuse.studies.plan import ERROR, MESSAGES, NODES, SETTINGS, Plan, default_method, put
@@ -28,7 +28,7 @@ from stochfuse.studies.plan import ERROR, MESSAGES, NODES, SETTINGS, Plan, defau
 LINK, Q, R, P0 = "network.link", "model.Q", "model.R", "initial.P"
 BATCHED = (LINK, Q, R, P0)
 """Keys whose numbers make a batch; a noise's number is that multiple of the identity."""
-PEDIGREES = ("local-fusion-graph", "optimal")
+PEDIGREES = (LFG, OPTIMAL)
 """Estimators whose messages bring all that is new to the receiver; the others send their latest estimate."""
 FAILED = 0
 """Number of steps of a point without an answer: it has one row."""
@@ -137,7 +137,7 @@ def _together(plan: Plan, points: range, found: Sequence[tuple[np.ndarray, _Grou
     return Answers(steps, values, what, tuple(kinds), dict(sorted(errors.items())))
 
 
-class _Asked(NamedTuple):
+class _Points(NamedTuple):
     """The points of a group, how they are predicted, and what becomes of them.
 
     Parameters
@@ -186,7 +186,7 @@ def _group(plan: Plan, values: Mapping[str, Any], numbers: Mapping[str, np.ndarr
         failed.errors.update(dict.fromkeys(range(size), _reason(error)))
         return failed
     group = _Group.empty(size, unit.network.steps, len(plan.columns), kind)
-    asked = _Asked(plan, method, {"workers": 1, **settings}, mapping, unit, numbers, group)
+    asked = _Points(plan, method, {"workers": 1, **settings}, mapping, unit, numbers, group)
     inside = _inside(numbers, size)
     rest = _batch(asked, np.flatnonzero(inside)) if inside.any() else np.arange(0)
     _by_noises(asked, np.union1d(rest, np.flatnonzero(~inside)))
@@ -213,7 +213,7 @@ def _inside(numbers: Mapping[str, np.ndarray], size: int) -> np.ndarray:
     return fine
 
 
-def _batch(asked: _Asked, items: np.ndarray) -> np.ndarray:
+def _batch(asked: _Points, items: np.ndarray) -> np.ndarray:
     """Evaluate items in one batch, or in as few as it takes to part those without an answer; return these."""
     unit, numbers, group = asked.unit, asked.numbers, asked.group
 
@@ -258,7 +258,7 @@ def _common_link(scenario: Scenario) -> float | None:
     return None if link is None or link.ndim or scenario.network.burst is not None else float(link)
 
 
-def _by_noises(asked: _Asked, items: np.ndarray) -> None:
+def _by_noises(asked: _Points, items: np.ndarray) -> None:
     """Evaluate items, those of equal noises together."""
     numbers = asked.numbers
     noises = [path for path in numbers if path != LINK]
@@ -275,7 +275,7 @@ def _by_noises(asked: _Asked, items: np.ndarray) -> None:
                 asked.fail(np.array([item]), error)
 
 
-def _of_noises(asked: _Asked, values: Mapping[str, float], items: np.ndarray) -> None:
+def _of_noises(asked: _Points, values: Mapping[str, float], items: np.ndarray) -> None:
     """Evaluate items of equal noises, together if that has an answer, else one by one."""
     try:
         # what its own link probability is does not matter: the items' are predicted
@@ -288,19 +288,19 @@ def _of_noises(asked: _Asked, values: Mapping[str, float], items: np.ndarray) ->
             _several(asked, scenario, np.array([item]))
 
 
-def _alone(asked: _Asked) -> bool:
+def _alone(asked: _Points) -> bool:
     """Whether the answer of a point depends on the company it is asked in."""
-    return asked.method == "monte-carlo" or bool(asked.settings.get("prune", False))
+    return asked.method == MONTE_CARLO or bool(asked.settings.get("prune", False))
 
 
-def _several(asked: _Asked, scenario: Scenario, items: np.ndarray) -> bool:
+def _several(asked: _Points, scenario: Scenario, items: np.ndarray) -> bool:
     """Predict items of one scenario; what is wrong with a single one is its error."""
     links, rows = None, np.zeros(len(items), dtype=int)
     if LINK in asked.numbers:
         links, rows = np.unique(asked.numbers[LINK][items], return_inverse=True)
     try:
         # what the optimum claims is the optimum
-        names = ["optimal" if asked.method == "optimal" and q == "claimed" else q for q in asked.quantities]
+        names = [OPTIMAL if asked.method == OPTIMAL and q == "claimed" else q for q in asked.quantities]
         different = list(dict.fromkeys(names))
         several = predict_several(scenario, links, asked.method, different, **asked.settings)
         found = [several[different.index(name)] for name in names]
@@ -317,7 +317,7 @@ def _several(asked: _Asked, scenario: Scenario, items: np.ndarray) -> bool:
 
 
 def _fill(
-    asked: _Asked, found: Sequence[Prediction], items: np.ndarray, rows: np.ndarray | slice = slice(None)
+    asked: _Points, found: Sequence[Prediction], items: np.ndarray, rows: np.ndarray | slice = slice(None)
 ) -> None:
     """Write the value columns of items, and note what is not finite."""
     plan, group = asked.plan, asked.group
@@ -335,10 +335,10 @@ def _fill(
                     group.values[items, :, plan.columns.index(name + ERROR)] = error[rows]
 
 
-def _kind(asked: _Asked, found: Sequence[Prediction]) -> Kind:
+def _kind(asked: _Points, found: Sequence[Prediction]) -> Kind:
     """Return method, estimator and nature of answers: of several quantities the nature of the least certain."""
     certain = ("exact", "sampled", "approximate", "bound")
-    own = next((p for p in found if p.quantity != "optimal"), found[0])
+    own = next((p for p in found if p.quantity != OPTIMAL), found[0])
     return asked.method, own.estimator, max((p.nature for p in found), key=certain.index)
 
 
@@ -354,7 +354,7 @@ def _check(p: Prediction, rows: np.ndarray, items: np.ndarray, group: _Group) ->
             group.errors.setdefault(int(item), f"the covariance at step {first[0]} is {first[1]}")
 
 
-def _messages(asked: _Asked) -> None:
+def _messages(asked: _Points) -> None:
     """Write the expected message load, which depends on the network alone."""
     group, numbers = asked.group, asked.numbers
     column = asked.plan.columns.index(NODES)
@@ -378,8 +378,8 @@ def _messages(asked: _Asked) -> None:
 
 def _load(scenario: Scenario, links: np.ndarray | None, estimator: str, agent: int | str) -> np.ndarray:
     """Expected nodes that an agent receives in each step, (links, steps)."""
-    rule = "local-fusion-graph" if estimator in PEDIGREES else "naive"
+    rule = LFG if estimator in PEDIGREES else NAIVE
     load = message_load(scenario, links, rule)
     whose = agent if isinstance(agent, int) else "mean"
     each = np.stack([load.between(k, k).mean(whose) for k in map(int, load.steps)], axis=1)
-    return 0.0 * each if estimator == "stand-alone" else each
+    return 0.0 * each if estimator == STAND_ALONE else each

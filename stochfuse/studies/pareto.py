@@ -21,15 +21,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from stochfuse.errors import NoAnswerError, UsageError
+from stochfuse.scenario.registry import BROADCAST_PRIOR, LFG, OPTIMAL, STAND_ALONE
 from stochfuse.studies.plan import ERROR, NODES, Plan
 
 if TYPE_CHECKING:
     from stochfuse.studies.files import Results
 
-COSTS = ("claimed", "actual", "optimal", "rms")
+COSTS = ("claimed", "actual", OPTIMAL, "rms")
 """Quantities of which less is better."""
 COMPARED_BITS = 40
-TRUTHFUL = ("broadcast-prior", "local-fusion-graph", "optimal", "stand-alone")
+TRUTHFUL = (BROADCAST_PRIOR, LFG, OPTIMAL, STAND_ALONE)
 """Estimators that claim what they achieve, as far as their method is exact."""
 
 

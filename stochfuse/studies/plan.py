@@ -24,9 +24,20 @@ from stochfuse.kalman.metrics import metric as metric_of
 from stochfuse.prediction.quantities import noun
 from stochfuse.prediction.quantities import unit as unit_of
 from stochfuse.scenario.checker import Checker
-from stochfuse.scenario.registry import CRITERIA, ESTIMATORS, METHODS, SUMS
+from stochfuse.scenario.registry import (
+    CRITERIA,
+    ESTIMATORS,
+    GENERAL,
+    LFG,
+    METHODS,
+    MONTE_CARLO,
+    NAIVE,
+    OPTIMAL,
+    SIMPLIFIED,
+    SUMS,
+)
 from stochfuse.scenario.scenario import Scenario
-from stochfuse.scenario.schema import Number, Table, problems_of
+from stochfuse.scenario.schema import Number, StrictTable, problems_of
 
 Words = str | list[str]
 EXPECTED = {
@@ -45,7 +56,7 @@ MOST_VALUES = 1_000_000
 """Values that one key may take."""
 
 
-class RangeTable(Table):
+class RangeTable(StrictTable):
     """Values from … to …: as many as `number`, or any of them in a Latin hypercube."""
 
     from_: Number = Field(alias="from")
@@ -55,7 +66,7 @@ class RangeTable(Table):
     whole: bool = Field(False, strict=True, description="round to whole numbers")
 
 
-class DesignTable(Table):
+class DesignTable(StrictTable):
     """How the varied values are combined into points."""
 
     kind: Literal["grid", "list", "latin-hypercube"] = Field(
@@ -65,7 +76,7 @@ class DesignTable(Table):
     seed: int | None = Field(None, ge=0, strict=True, description="of a Latin hypercube, default 1")
 
 
-class PredictTable(Table):
+class PredictTable(StrictTable):
     """How every point is predicted; see `stochfuse predict --help`."""
 
     method: Literal[METHODS] | None = None  # type: ignore[valid-type]
@@ -77,7 +88,7 @@ class PredictTable(Table):
     prune: bool | None = Field(None, strict=True)
 
 
-class StudyReportTable(Table):
+class StudyReportTable(StrictTable):
     """What is tabulated of every point and step."""
 
     quantity: Words = Field("claimed", description="as --quantity takes them, and messages (nodes received)")
@@ -87,7 +98,7 @@ class StudyReportTable(Table):
     )
 
 
-class StudyFile(Table):
+class StudyFile(StrictTable):
     """A stochfuse study."""
 
     model_config = ConfigDict(
@@ -260,7 +271,7 @@ SETTINGS = ("method", "estimator", "criterion", "runs", "seed", "max_graphs", "p
 KEY = "a key of the scenario such as network.link or agent[2].R (of the second agent table)"
 MESSAGES, NODES = "messages", "messages.nodes"
 ERROR = ".standard_error"
-CHUNK = {"simplified": 16384, "general": 256, "naive": 256, "optimal": 256, "monte-carlo": 4}
+CHUNK = {SIMPLIFIED: 16384, GENERAL: 256, NAIVE: 256, OPTIMAL: 256, MONTE_CARLO: 4}
 """Points that are evaluated, and written, together."""
 LEAST_PARTS = 16
 """Chunks of a study, if it has as many points, of which single ones may take long."""
@@ -314,7 +325,7 @@ class Plan:
             for m in map(self.metric, self.metrics):
                 unit = unit_of(quantity, m)
                 found[f"{quantity}.{m.name}"] = f"{quantity} {noun(quantity, m)}{f' [{unit}]' if unit else ''}"
-                if "monte-carlo" in self.methods:
+                if MONTE_CARLO in self.methods:
                     found[f"{quantity}.{m.name}{ERROR}"] = f"standard error of {found[f'{quantity}.{m.name}']}"
         return found
 
@@ -342,11 +353,11 @@ class Plan:
     @cached_property
     def chunk(self) -> int:
         """Points that are evaluated together, the same whoever does it: so results are the same to the last bit."""
-        estimators = self._taken("estimator", (self.example.estimator or "local-fusion-graph",))
+        estimators = self._taken("estimator", (self.example.estimator or LFG,))
         most = min(CHUNK[method] for method in self.methods)
-        if set(self.methods) & {"general"} and not set(estimators) <= set(SUMS):
+        if set(self.methods) & {GENERAL} and not set(estimators) <= set(SUMS):
             most = min(most, CHUNK_OF_PASTS)
-        if set(self.methods) & {"general", "naive", "optimal"}:
+        if set(self.methods) & {GENERAL, NAIVE, OPTIMAL}:
             # a few points can be hours of work, of which some should be kept, and which workers should share
             most = min(most, -(-self.size // LEAST_PARTS))
         steps = next((a for a in self.axes if a.name == "network.steps"), None)
@@ -400,7 +411,7 @@ def default_method(scenario: Scenario, given: set[str]) -> str:
     """Return the method where none is named: the scenario's, or the one that what is named belongs to."""
     if scenario.method is not None:
         return scenario.method
-    return "monte-carlo" if "runs" in given else "general" if "estimator" in given else "simplified"
+    return MONTE_CARLO if "runs" in given else GENERAL if "estimator" in given else SIMPLIFIED
 
 
 def put(mapping: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:

@@ -41,7 +41,7 @@ MOST_DEADLY = 3
 AGAIN = "finished points are kept: the same command goes on"
 
 
-class Progress:
+class StudyProgress:
     """How far a study is; this one says nothing."""
 
     def begin(self, points: int, done: int, what: str) -> None:
@@ -58,7 +58,7 @@ def study(
     workers: int = 1,
     executor: Executor | None = None,
     restart: bool = False,
-    progress: Progress | None = None,
+    progress: StudyProgress | None = None,
 ) -> Results:
     """Run a study, or go on with it where it stopped.
 
@@ -90,7 +90,7 @@ def study(
     plan = load_study(source)
     target = result_path(source, output)
     check_format(target)
-    progress = progress or Progress()
+    progress = progress or StudyProgress()
     journal = Journal(target, plan.record, plan.name)
     if not restart and journal.finished:
         journal.clean()
@@ -118,7 +118,7 @@ def results_of(plan: Plan, journal: Journal) -> Results:
     return Results(plan, journal.output, facts["rows"], facts["failed"], errors)
 
 
-def _write(plan: Plan, journal: Journal, path: Path, progress: Progress) -> dict[str, Any]:
+def _write(plan: Plan, journal: Journal, path: Path, progress: StudyProgress) -> dict[str, Any]:
     progress.begin(plan.size, 0, "writing")
 
     def answers() -> Iterator[Any]:
@@ -136,7 +136,7 @@ def _write(plan: Plan, journal: Journal, path: Path, progress: Progress) -> dict
 
 
 def _work(
-    plan: Plan, journal: Journal, done: set[int], executor: Executor | None, workers: int, progress: Progress
+    plan: Plan, journal: Journal, done: set[int], executor: Executor | None, workers: int, progress: StudyProgress
 ) -> None:
     todo = [chunk for chunk in range(plan.chunks) if chunk not in done]
     progress.begin(plan.size, plan.size - sum(len(plan.range_of(c)) for c in todo), "computing")

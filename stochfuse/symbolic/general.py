@@ -21,7 +21,7 @@ import sympy
 from sympy.polys.fields import field
 
 from stochfuse.engines.enumeration import Request, enumerate_outcomes
-from stochfuse.engines.events import Counts, events, orbits, relabellings
+from stochfuse.engines.events import CountWeights, events, orbits, relabellings
 from stochfuse.errors import TooManyError, UsageError
 from stochfuse.estimators.ledger import Information, Ledger, Sources, evaluate_exactly
 from stochfuse.estimators.making import rule_of
@@ -29,6 +29,7 @@ from stochfuse.kalman.algebra import FIELD
 from stochfuse.prediction.general import check_size
 from stochfuse.scenario.model import Model, Sensor
 from stochfuse.scenario.network import Network, uniform_rows
+from stochfuse.scenario.registry import LFG
 from stochfuse.symbolic.simplified import MU, P0, Q, R, exact_number
 
 MOST_OUTCOMES = 2_000_000
@@ -57,7 +58,7 @@ class GeneralForm:
     r: Any = R
     p0: Any = P0
     shared: bool = False
-    estimator: str = "local-fusion-graph"
+    estimator: str = LFG
 
     @property
     def symbols(self) -> tuple[sympy.Symbol, ...]:
@@ -130,7 +131,7 @@ class GeneralForm:
         rows, labels = uniform_rows([0.5]), (0,) * self.agents
         permutations = relabellings(network, rows, labels)
         drawn = events(network, rows, 1)
-        weights = Counts(self.step * len(drawn) + 1)
+        weights = CountWeights(self.step * len(drawn) + 1)
         ledger = Ledger()
         estimator = rule_of(self.estimator)(ledger, labels, shared=self.shared, relabellings=permutations)
         groups = tuple(orbits(self.agents, permutations))
@@ -147,7 +148,8 @@ class GeneralForm:
         found: dict[int, list[Any]] = {}
         for view in ending.views:
             # agents are alike, whether or not relabellings were found that show it
-            share = sum(s * (len(g) / self.agents) for s, g in zip(view.shares, groups, strict=True) if s is not None)
+            parts = [s * (len(g) / self.agents) for s, g in zip(view.shares, groups, strict=True) if s is not None]
+            share = np.sum(parts, axis=0)
             factor_of = np.repeat(view.factors, np.diff([*view.starts, len(view.terms[0][1])]), axis=0)
             for ids, weight in zip(view.ids, ending.weights, strict=True):
                 for cell, factor in enumerate(factor_of):
@@ -203,7 +205,7 @@ def derive_general(
     *,
     architecture: str = "ad-hoc",
     correlation: str = "independent",
-    estimator: str = "local-fusion-graph",
+    estimator: str = LFG,
 ) -> GeneralForm:
     """Return (49) as formulas, for like agents with a scalar state.
 

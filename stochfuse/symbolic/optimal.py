@@ -22,6 +22,7 @@ from stochfuse.engines.events import events
 from stochfuse.errors import UsageError
 from stochfuse.estimators.ledger import Ledger
 from stochfuse.scenario.network import Network, uniform_rows
+from stochfuse.scenario.registry import OPTIMAL
 from stochfuse.symbolic.general import GeneralForm, derive_general
 from stochfuse.symbolic.simplified import MU
 
@@ -88,9 +89,7 @@ def derive_optimal(
     correlation: str = "independent",
 ) -> OptimalForm:
     """Return the expected optimum as formulas; parameters and errors are those of `derive_general`."""
-    form = derive_general(
-        agents, step, q, r, p0, architecture=architecture, correlation=correlation, estimator="optimal"
-    )
+    form = derive_general(agents, step, q, r, p0, architecture=architecture, correlation=correlation, estimator=OPTIMAL)
     return OptimalForm(**{field.name: getattr(form, field.name) for field in fields(form)})
 
 

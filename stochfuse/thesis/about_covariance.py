@@ -9,7 +9,7 @@ import numpy as np
 from stochfuse.kalman.kernel import Estimate, predict, update
 from stochfuse.scenario.model import Sensor
 from stochfuse.scenario.scenario import Scenario
-from stochfuse.thesis.bench import ARCHITECTURES, LINKS, STEADY, TRANSIENT, Bench, Case
+from stochfuse.thesis.bench import ARCHITECTURES, LINKS, STEADY, TRANSIENT, Bench, ThesisCase
 from stochfuse.thesis.statements import Statement, Verdict, figures, judged, listed
 
 FIRST = {TRANSIENT: (20, 23), STEADY: (36, 39)}
@@ -75,14 +75,14 @@ def _rising_runs(bench: Bench) -> Verdict:
     )
 
 
-def _known_algorithms(bench: Bench, case: Case, architecture: str) -> Verdict:
+def _known_algorithms(bench: Bench, case: ThesisCase, architecture: str) -> Verdict:
     P, scenario = bench.claimed(case, architecture), bench.scenario(case, architecture)
     full = full_rate_cyclic(scenario) if architecture == "cyclic" else full_rate(scenario, scenario.network.agents)
     away = max(np.abs(P[0] / full_rate(scenario, 1) - 1).max(), np.abs(P[-1] / full - 1).max())
     return judged(away < 1e-9, f"largest relative difference {away:.0e}")
 
 
-def _falls_with_links(bench: Bench, case: Case, architecture: str) -> Verdict:
+def _falls_with_links(bench: Bench, case: ThesisCase, architecture: str) -> Verdict:
     P = bench.claimed(case, architecture)
     return judged((np.diff(P, axis=0) < 0).all(), f"last step: {listed(P[:, -1])} at 0, 25, 50, 75, 100 %")
 
@@ -92,7 +92,7 @@ def share_at_half(P: np.ndarray) -> np.ndarray:
     return (P[0] - P[2]) / (P[0] - P[-1])
 
 
-def _non_linear(bench: Bench, case: Case, architecture: str) -> Verdict:
+def _non_linear(bench: Bench, case: ThesisCase, architecture: str) -> Verdict:
     share = share_at_half(bench.claimed(case, architecture))
     later = share[1:] if architecture == "cyclic" else share
     return judged((later > 0.5 + 1e-9).all(), f"share at 50 %: {listed(100 * share, 3)} % at k=1–{bench.steps}")
@@ -109,7 +109,7 @@ def _bend_grows(bench: Bench, architecture: str) -> Verdict:
     return judged(found[0] == found.min() and found[-1] > found[0], f"at k=1–{bench.steps}: {listed(found, 3)}")
 
 
-def _same_by_network(bench: Bench, case: Case) -> Verdict:
+def _same_by_network(bench: Bench, case: ThesisCase) -> Verdict:
     a, b = bench.claimed(case, "ad-hoc"), bench.claimed(case, "broadcast")
     away = 100 * np.abs(a / b - 1).max()
     return judged(away < 2, f"they differ by at most {away:.2g} %")

@@ -7,8 +7,9 @@ from functools import partial
 import numpy as np
 
 from stochfuse.kalman.kernel import Estimate, predict, update
+from stochfuse.scenario.registry import LFG
 from stochfuse.thesis import bench as records
-from stochfuse.thesis.bench import ARCHITECTURES, LFG, LINKS, TRANSIENT, Bench, Case, noise_order
+from stochfuse.thesis.bench import ARCHITECTURES, LINKS, TRANSIENT, Bench, ThesisCase, noise_order
 from stochfuse.thesis.figures import RATIOS, averaged_errors, change, percent
 from stochfuse.thesis.statements import Statement, Verdict, explained, figures, judged, listed
 
@@ -18,7 +19,13 @@ CAUSE = "without the common initial error it falls steadily"
 
 
 def averaged(
-    bench: Bench, architecture: str, links=LINKS, case: Case = TRANSIENT, rule: str = LFG, *, initial_error: bool = True
+    bench: Bench,
+    architecture: str,
+    links=LINKS,
+    case: ThesisCase = TRANSIENT,
+    rule: str = LFG,
+    *,
+    initial_error: bool = True,
 ) -> np.ndarray:
     """Return the time-averaged RMS error, averaged over links and noise, (links,)."""
     weights = bench.weights(case, architecture, links, rule)
@@ -145,15 +152,15 @@ def _optimism(bench: Bench) -> Verdict:
     return judged(not all(_falls_without_error(bench, a) for a in ARCHITECTURES), ours)
 
 
-def rise(bench: Bench, case: Case, architecture: str) -> float:
+def rise(bench: Bench, case: ThesisCase, architecture: str) -> float:
     """Return how far the time-averaged RMS error rises above that at 0 %, in per cent, over eighths of connectivity."""
     return float(change(averaged(bench, architecture, EIGHTHS, case)).max())
 
 
 def _grows_with_process_noise(bench: Bench, architecture: str) -> Verdict:
-    found = [rise(bench, Case("transient", q=q), architecture) for _, q in RATIOS]
+    found = [rise(bench, ThesisCase("transient", q=q), architecture) for _, q in RATIOS]
     without = [
-        change(averaged(bench, architecture, EIGHTHS, Case("transient", q=q), initial_error=False)).max()
+        change(averaged(bench, architecture, EIGHTHS, ThesisCase("transient", q=q), initial_error=False)).max()
         for _, q in RATIOS
     ]
     ours = (
@@ -164,7 +171,9 @@ def _grows_with_process_noise(bench: Bench, architecture: str) -> Verdict:
 
 
 def _low_ratio_falls(bench: Bench) -> Verdict:
-    found = {a: change(averaged(bench, a, EIGHTHS, Case("transient", q=RATIOS[0][1]))) for a in ("broadcast", "cyclic")}
+    found = {
+        a: change(averaged(bench, a, EIGHTHS, ThesisCase("transient", q=RATIOS[0][1]))) for a in ("broadcast", "cyclic")
+    }
     ours = "; ".join(f"{a} rises by {values.max():.1f} %" for a, values in found.items())
     return judged(all(v.max() <= 0 for v in found.values()), f"at Q/R = {RATIOS[0][0]} {ours}", "open")
 

@@ -6,7 +6,8 @@ from functools import partial
 
 import numpy as np
 
-from stochfuse.thesis.bench import ARCHITECTURES, LINKS, NAIVE, STATED_WINDOW, WINDOW, Bench, table_3_rows
+from stochfuse.scenario.registry import NAIVE
+from stochfuse.thesis.bench import ARCHITECTURES, LINKS, STATED_WINDOW, WINDOW, Bench, table_3_rows
 from stochfuse.thesis.figures import mean_size
 from stochfuse.thesis.statements import Statement, Verdict, explained, figures, judged, listed
 

@@ -9,34 +9,35 @@ from functools import partial
 
 import numpy as np
 
+from stochfuse.scenario.registry import LFG, NAIVE, SIMPLIFIED
 from stochfuse.thesis.about_errors import averaged, rms_by_step
-from stochfuse.thesis.bench import LFG, LINKS, NAIVE, SIMPLIFIED, STEADY, TRANSIENT, Bench, Case
+from stochfuse.thesis.bench import LINKS, STEADY, TRANSIENT, Bench, ThesisCase
 from stochfuse.thesis.figures import covariance_difference, mean_size, percent, relative_errors
 from stochfuse.thesis.statements import Statement, Verdict, figures, judged, listed
 
 
-def _naive_below(bench: Bench, case: Case) -> Verdict:
+def _naive_below(bench: Bench, case: ThesisCase) -> Verdict:
     naive, best = bench.claimed(case, "ad-hoc", rule=NAIVE)[-1], bench.claimed(case, "ad-hoc")[-1]
     return judged((naive[1:] < best[1:]).all(), f"naive {listed(naive)} against {listed(best)} at 100 %")
 
 
-def _naive_shape(bench: Bench, case: Case) -> Verdict:
+def _naive_shape(bench: Bench, case: ThesisCase) -> Verdict:
     naive, best = bench.claimed(case, "ad-hoc", rule=NAIVE), bench.claimed(case, "ad-hoc")
     falls = (np.diff(naive, axis=0) < 0).all() and (naive[1:, 1:] < best[1:, 1:]).all()
     return judged(falls, f"last step: naive {listed(naive[:, -1])}, Local Fusion Graph {listed(best[:, -1])}")
 
 
-def _equal_first(bench: Bench, case: Case) -> Verdict:
+def _equal_first(bench: Bench, case: ThesisCase) -> Verdict:
     away = np.abs(_relative(bench, case)[:, 0]).max()
     return judged(away < 1e-9, f"largest relative difference at k=1 {away:.0e}")
 
 
-def _relative(bench: Bench, case: Case) -> np.ndarray:
+def _relative(bench: Bench, case: ThesisCase) -> np.ndarray:
     """Simplified less exact claimed covariance, relative to the exact one, (links, steps)."""
     return bench.claimed(case, "ad-hoc", rule=SIMPLIFIED) / bench.claimed(case, "ad-hoc", rule=LFG) - 1
 
 
-def _converge_but_25(bench: Bench, case: Case) -> Verdict:
+def _converge_but_25(bench: Bench, case: ThesisCase) -> Verdict:
     away = 100 * np.abs(_relative(bench, case))[1:4]
     peak, last = away.max(axis=1), away[:, -1]
     ours = f"largest and last difference: 25 % {peak[0]:.2f}, {last[0]:.2f}; 50 % {peak[1]:.2f}, {last[1]:.2f}; 75 % "
@@ -67,7 +68,7 @@ def _naive_grows(bench: Bench) -> Verdict:
     return judged((np.diff(found) > 0).all(), ours)
 
 
-def best_of_naive(bench: Bench, case: Case) -> Verdict:
+def best_of_naive(bench: Bench, case: ThesisCase) -> Verdict:
     """Compare the two rules in an ad hoc network."""
     here, naive = (averaged(bench, "ad-hoc", case=case, rule=rule) for rule in (LFG, NAIVE))
     ours = f"Local Fusion Graph {listed(here[1:])}; naive {listed(naive[1:])} at 25 to 100 % (ad hoc)"
@@ -90,7 +91,7 @@ def _opposite_trends(bench: Bench) -> Verdict:
     return judged(here[1] > 1 and simplified[1] < 1, ours)
 
 
-def _largest_at_25(bench: Bench, case: Case) -> Verdict:
+def _largest_at_25(bench: Bench, case: ThesisCase) -> Verdict:
     found = relative_errors(bench, one_record=False)
     away = np.abs(found[case.name, SIMPLIFIED] - found[case.name, LFG])
     return judged(away.argmax() == 1, f"{listed(away, 3)} at 0 to 100 %")

@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from stochfuse.scenario.registry import LFG, NAIVE, SIMPLIFIED
 from stochfuse.thesis import bench as records
 from stochfuse.thesis.about_errors import averaged
 from stochfuse.thesis.about_methods import best_of_naive
-from stochfuse.thesis.bench import ARCHITECTURES, LFG, NAIVE, SIMPLIFIED, STEADY, Bench
+from stochfuse.thesis.bench import ARCHITECTURES, STEADY, Bench
 from stochfuse.thesis.figures import averaged_errors, time_average
 from stochfuse.thesis.statements import Statement, Verdict, figures, judged, listed
 

@@ -39,6 +39,7 @@ from stochfuse.prediction.method import Settings
 from stochfuse.prediction.predict import predict
 from stochfuse.prediction.states import predict_states
 from stochfuse.questions.messages import MessageLoad, message_load
+from stochfuse.scenario.registry import LFG, MONTE_CARLO, SIMPLIFIED
 from stochfuse.scenario.scenario import Scenario, link_rows, load_scenario
 
 WINDOWS = ((6, 10), (6, 12))
@@ -51,7 +52,7 @@ TABLE_3 = {
 """Mean, maximum and standard deviation at µ = 0, 0.25, 0.5, 0.75, 1: thesis table 3, 3 agents, 1000 runs."""
 
 
-class Moments(NamedTuple):
+class RecordMoments(NamedTuple):
     """Mean, largest and standard deviation of a load in nodes."""
 
     mean: float
@@ -72,8 +73,8 @@ class Row(NamedTuple):
 
     column: str
     link: float
-    thesis: Moments
-    ours: dict[tuple[str, int, int], Moments]
+    thesis: RecordMoments
+    ours: dict[tuple[str, int, int], RecordMoments]
 
 
 def table_3_rows() -> tuple[Row, ...]:
@@ -88,12 +89,12 @@ def table_3_rows() -> tuple[Row, ...]:
         for window in WINDOWS:
             load = whole.between(*window)
             moments = zip(load.mean().tolist(), load.maximum().tolist(), load.std().tolist(), strict=True)
-            loads[architecture, *window] = [Moments(*m) for m in moments]
+            loads[architecture, *window] = [RecordMoments(*m) for m in moments]
     return tuple(
         Row(
             column,
             float(µ),
-            Moments(*thesis[i]),
+            RecordMoments(*thesis[i]),
             {
                 key: moments[i]
                 for key, moments in loads.items()
@@ -153,13 +154,13 @@ def truth(scenario: Scenario, records: np.ndarray) -> np.ndarray:
 
 LINKS = (0.0, 0.25, 0.5, 0.75, 1.0)
 ARCHITECTURES = ("ad-hoc", "broadcast", "cyclic")
-LFG, NAIVE, SIMPLIFIED = "local-fusion-graph", "naive", "simplified"
+
 STATED_WINDOW, WINDOW = WINDOWS
 """Steps over which message loads are averaged: as the thesis says, and as the maxima of its table 3 need."""
 
 
 @dataclass(frozen=True)
-class Case:
+class ThesisCase:
     """A scenario of the thesis: a preset, with other noises where a figure asks for them.
 
     Parameters
@@ -173,7 +174,7 @@ class Case:
     r: float | None = None
 
 
-TRANSIENT, STEADY = Case("transient"), Case("steady")
+TRANSIENT, STEADY = ThesisCase("transient"), ThesisCase("steady")
 
 
 class Averages(NamedTuple):
@@ -252,14 +253,14 @@ class Bench:
             self.known[key] = make()
         return self.known[key]
 
-    def scenario(self, case: Case, architecture: str) -> Scenario:
+    def scenario(self, case: ThesisCase, architecture: str) -> Scenario:
         """Return a scenario of the thesis.  P(k0) of the transient one is R, as its table 2 has it."""
         p0 = case.r if case.name == "transient" else None
         return load_scenario(
             f"thesis-{case.name}", architecture=architecture, steps=self.steps, q=case.q, r=case.r, p0=p0
         )
 
-    def averages(self, case: Case, architecture: str, rule: str = LFG, *, errors: bool = True) -> list[Averages]:
+    def averages(self, case: ThesisCase, architecture: str, rule: str = LFG, *, errors: bool = True) -> list[Averages]:
         """What is averaged over the outcomes, per step; perhaps without footprints, where errors are not wanted."""
 
         def make() -> list[Averages]:
@@ -273,18 +274,20 @@ class Bench:
         key = ("averages", case, architecture, rule)
         return self.known.get((*key, True)) or self.once((*key, errors), make)
 
-    def extremes(self, case: Case, architecture: str, rule: str = LFG) -> np.ndarray:
+    def extremes(self, case: ThesisCase, architecture: str, rule: str = LFG) -> np.ndarray:
         """Smallest and largest covariance claimed in any outcome that links of 0 < µ < 1 allow, (steps, 2)."""
         return np.array([step.extremes for step in self.averages(case, architecture, rule, errors=False)])
 
-    def claimed(self, case: Case, architecture: str, links: Sequence[float] = LINKS, rule: str = LFG) -> np.ndarray:
+    def claimed(
+        self, case: ThesisCase, architecture: str, links: Sequence[float] = LINKS, rule: str = LFG
+    ) -> np.ndarray:
         """Expected claimed covariance, (links, steps): exact, or approximate by (54) for the simplified rule."""
         if rule == SIMPLIFIED:
-            return predict(self.scenario(case, architecture), list(links), method="simplified").values()
+            return predict(self.scenario(case, architecture), list(links), method=SIMPLIFIED).values()
         found = self.averages(case, architecture, rule, errors=False)
         return np.stack([_at(step.P, links) for step in found], axis=1)
 
-    def weights(self, case: Case, architecture: str, links: Sequence[float] = LINKS, rule: str = LFG) -> Weights:
+    def weights(self, case: ThesisCase, architecture: str, links: Sequence[float] = LINKS, rule: str = LFG) -> Weights:
         """Moments of the footprint at some link probabilities."""
         return self.once(
             ("weights", case, architecture, tuple(links), rule),
@@ -295,20 +298,20 @@ class Bench:
             ),
         )
 
-    def _weights(self, case: Case, architecture: str, links: Sequence[float], rule: str) -> Weights:
+    def _weights(self, case: ThesisCase, architecture: str, links: Sequence[float], rule: str) -> Weights:
         found = self.averages(case, architecture, rule)
         first = np.stack([_at(step.first, links) for step in found], axis=1)
         return Weights(first, np.stack([_at(step.second, links) for step in found], axis=1))
 
-    def _simplified_weights(self, case: Case, architecture: str, links: Sequence[float]) -> Weights:
+    def _simplified_weights(self, case: ThesisCase, architecture: str, links: Sequence[float]) -> Weights:
         scenario = self.scenario(case, architecture)
         x = _simplified_footprint(scenario, links)
         return Weights(x.mean(axis=2), np.einsum("lkai,lkaj->lkij", x, x) / scenario.network.agents)
 
-    def sample(self, case: Case, architecture: str, links: Sequence[float], runs: int) -> np.ndarray:
+    def sample(self, case: ThesisCase, architecture: str, links: Sequence[float], runs: int) -> np.ndarray:
         """Covariance that agent 1 claims in some sampled runs, (links, runs, steps)."""
         found = predict(
-            self.scenario(case, architecture), list(links), method="monte-carlo", runs=runs, seed=self.seed
+            self.scenario(case, architecture), list(links), method=MONTE_CARLO, runs=runs, seed=self.seed
         ).sampled
         if found is None:
             raise TypeError("a sample was asked for")
@@ -360,7 +363,7 @@ def _simplified_footprint(scenario: Scenario, links: Sequence[float]) -> np.ndar
     one, none = replace(scenario, x0=np.ones((1, 1))), replace(scenario, x0=np.zeros((1, 1)))
     links = list(links)
     start = predict_states(one, zeros, links).x[..., 0]
-    P1 = predict(scenario, links, method="simplified").values()[:, 0]
+    P1 = predict(scenario, links, method=SIMPLIFIED).values()[:, 0]
     own = P1 / scenario.P0.item()
     noises = n + (steps - 1) * (n + 1) + 1
     x = np.zeros((len(links), steps, n, noises))

@@ -11,11 +11,12 @@ from dataclasses import dataclass, replace
 
 from stochfuse.errors import UsageError
 from stochfuse.report.reproductions import Finding, Panel, Sheet
+from stochfuse.scenario.registry import LFG, NAIVE, SIMPLIFIED
 from stochfuse.thesis import about_covariance, about_errors, about_messages, about_methods, about_records
 from stochfuse.thesis import figures as compared
 from stochfuse.thesis import figures as f
 from stochfuse.thesis import tables as published
-from stochfuse.thesis.bench import LFG, NAIVE, SIMPLIFIED, STEADY, TRANSIENT, Bench, Case
+from stochfuse.thesis.bench import STEADY, TRANSIENT, Bench, ThesisCase
 from stochfuse.thesis.statements import Statement
 
 ONE_RECORD = (
@@ -104,7 +105,9 @@ def _chapter_3() -> Iterator[Item]:
     yield Item("figure-48", f"{title}, steady state", make, notes=notes)
 
 
-def _scenario(case: Case, name: str, *, covariance: int, normalised: int, states: int, errors: int) -> Iterator[Item]:
+def _scenario(
+    case: ThesisCase, name: str, *, covariance: int, normalised: int, states: int, errors: int
+) -> Iterator[Item]:
     for i, (architecture, shown) in enumerate(NAMES.items()):
         tail = f"{shown} network, {name}"
         yield Item(

@@ -9,20 +9,18 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from stochfuse.report.reproductions import Curve, Panel
+from stochfuse.report.reproductions import DrawnCurve, Panel
+from stochfuse.scenario.registry import LFG, NAIVE, SIMPLIFIED
 from stochfuse.thesis import bench as records
 from stochfuse.thesis.bench import (
     ARCHITECTURES,
-    LFG,
     LINKS,
-    NAIVE,
-    SIMPLIFIED,
     STATED_WINDOW,
     STEADY,
     TRANSIENT,
     WINDOW,
     Bench,
-    Case,
+    ThesisCase,
     Weights,
 )
 
@@ -46,23 +44,23 @@ def percent(link: float) -> str:
     return f"{100 * link:g} %"
 
 
-def over_steps(bench: Bench, title: str, y: str, curves: Sequence[Curve], y_range=None) -> Panel:
+def over_steps(bench: Bench, title: str, y: str, curves: Sequence[DrawnCurve], y_range=None) -> Panel:
     """Return curves over the time step."""
     x = np.arange(1, bench.steps + 1)
     return Panel(title, "time step", y, tuple(f"k={k}" for k in x), x, tuple(curves), y_range)
 
 
-def over_links(title: str, y: str, curves: Sequence[Curve], links: Sequence[float] = LINKS) -> Panel:
+def over_links(title: str, y: str, curves: Sequence[DrawnCurve], links: Sequence[float] = LINKS) -> Panel:
     """Return curves over the link probability."""
     return Panel(title, CONNECTIVITY, y, tuple(map(percent, links)), np.array(links), tuple(curves))
 
 
-def per_link(values: np.ndarray, name: str = "") -> list[Curve]:
+def per_link(values: np.ndarray, name: str = "") -> list[DrawnCurve]:
     """Return a curve over steps per link probability, of values (links, steps)."""
-    return [Curve(name + percent(link), row) for link, row in zip(LINKS, values, strict=True)]
+    return [DrawnCurve(name + percent(link), row) for link, row in zip(LINKS, values, strict=True)]
 
 
-def covariance(case: Case, architecture: str, rules: Sequence[str] = (LFG,)) -> Make:
+def covariance(case: ThesisCase, architecture: str, rules: Sequence[str] = (LFG,)) -> Make:
     """Figures 20–22, 36–38, 56, 58, 65, 66: claimed covariance over time, one curve per connectivity."""
 
     def make(bench: Bench) -> tuple[Panel, ...]:
@@ -79,18 +77,18 @@ def covariance(case: Case, architecture: str, rules: Sequence[str] = (LFG,)) -> 
     return make
 
 
-def normalised(case: Case, architecture: str) -> Make:
+def normalised(case: ThesisCase, architecture: str) -> Make:
     """Figures 23–25, 39–41: claimed covariance relative to that without links, one curve per step."""
 
     def make(bench: Bench) -> tuple[Panel, ...]:
         P = bench.claimed(case, architecture)
-        curves = [Curve(f"k={k}", column) for k, column in enumerate((P / P[0]).T, start=1)]
+        curves = [DrawnCurve(f"k={k}", column) for k, column in enumerate((P / P[0]).T, start=1)]
         return (over_links("Local Fusion Graph, exact average over links", "claimed covariance / that at 0 %", curves),)
 
     return make
 
 
-def states(case: Case, architecture: str, rules: Sequence[str] = (LFG,)) -> Make:
+def states(case: ThesisCase, architecture: str, rules: Sequence[str] = (LFG,)) -> Make:
     """Figures 26–28, 42–44, 57, 59, 69, 70: mean state estimate over time, with the truth."""
 
     def make(bench: Bench) -> tuple[Panel, ...]:
@@ -106,14 +104,14 @@ def states(case: Case, architecture: str, rules: Sequence[str] = (LFG,)) -> Make
                 (NOISE if exact else APPROXIMATELY, expected, weights.first[..., -1]),
                 (one_record(bench, exact=exact), true, weights.mean_given(drawn)[0]),
             ):
-                curves = [Curve("true state", x), *per_link(x + error)]
+                curves = [DrawnCurve("true state", x), *per_link(x + error)]
                 panels.append(over_steps(bench, f"{RULES[rule]}, {title}", "mean state estimate", curves))
         return tuple(panels)
 
     return make
 
 
-def errors(case: Case, architecture: str) -> Make:
+def errors(case: ThesisCase, architecture: str) -> Make:
     """Figures 29–31, 45–47: RMS error over time, one curve per connectivity."""
 
     def make(bench: Bench) -> tuple[Panel, ...]:
@@ -134,7 +132,13 @@ def time_average(rms: np.ndarray) -> np.ndarray:
 
 
 def averaged_errors(
-    bench: Bench, weights: Weights, case: Case, architecture: str, data: str = "own", *, initial_error: bool = True
+    bench: Bench,
+    weights: Weights,
+    case: ThesisCase,
+    architecture: str,
+    data: str = "own",
+    *,
+    initial_error: bool = True,
 ) -> np.ndarray:
     """Return the time-averaged RMS error, averaged over the noise, (links,)."""
     spread = records.spread(bench.scenario(case, architecture), data, initial_error=initial_error)
@@ -142,7 +146,7 @@ def averaged_errors(
 
 
 def errors_of_records(
-    bench: Bench, weights: Weights, case: Case, architecture: str, number: int, data: str = "own"
+    bench: Bench, weights: Weights, case: ThesisCase, architecture: str, number: int, data: str = "own"
 ) -> np.ndarray:
     """Return the time-averaged RMS error of single records, (records, links)."""
     drawn = records.draw(bench.scenario(case, architecture), number, bench.seed, data)
@@ -155,7 +159,7 @@ def change(values: np.ndarray) -> np.ndarray:
 
 
 def averaged_over_time(
-    cases: Sequence[tuple[str, Case, str]], links: Sequence[float] = LINKS, variants: Sequence[str] = ()
+    cases: Sequence[tuple[str, ThesisCase, str]], links: Sequence[float] = LINKS, variants: Sequence[str] = ()
 ) -> Make:
     """Figures 32–35, 48: time-averaged RMS error over connectivity, one curve per (name, case, architecture).
 
@@ -169,13 +173,13 @@ def averaged_over_time(
         y = f"RMS error (actual), mean over steps 2–{bench.steps}"
         single = [(n, errors_of_records(bench, w, c, a, FEW)) for n, c, a, w in found]
         panels = [
-            over_links(NOISE, y, [Curve(n, averaged_errors(bench, w, c, a)) for n, c, a, w in found], links),
-            over_links(one_record(bench), y, [Curve(n, e[0]) for n, e in single], links),
+            over_links(NOISE, y, [DrawnCurve(n, averaged_errors(bench, w, c, a)) for n, c, a, w in found], links),
+            over_links(one_record(bench), y, [DrawnCurve(n, e[0]) for n, e in single], links),
             over_links(
                 f"{FEW} single records: median, lowest and highest",
                 "change of that RMS error against 0 %, in per cent of it",
                 [
-                    Curve(n, np.median(change(e), axis=0), change(e).min(axis=0), change(e).max(axis=0))
+                    DrawnCurve(n, np.median(change(e), axis=0), change(e).min(axis=0), change(e).max(axis=0))
                     for n, e in single
                 ],
                 links,
@@ -183,7 +187,7 @@ def averaged_over_time(
         ]
         for variant in variants:
             title, options = VARIANTS[variant]
-            curves = [Curve(n, averaged_errors(bench, w, c, a, **options)) for n, c, a, w in found]
+            curves = [DrawnCurve(n, averaged_errors(bench, w, c, a, **options)) for n, c, a, w in found]
             panels.append(over_links(f"{NOISE}, {title}", y, curves, links))
         return tuple(panels)
 
@@ -197,7 +201,7 @@ VARIANTS = {
 }
 
 
-def by_architecture(case: Case) -> list[tuple[str, Case, str]]:
+def by_architecture(case: ThesisCase) -> list[tuple[str, ThesisCase, str]]:
     """Return the three networks of the thesis in one scenario."""
     return [(a.replace("-", " "), case, a) for a in ARCHITECTURES]
 
@@ -206,9 +210,9 @@ RATIOS = (("1/16", 6.25), ("1/4", 25.0), ("4", 400.0))
 """Ratios Q/R; the thesis' own three are not in its text, only 1:4 is."""
 
 
-def by_ratio(architecture: str) -> list[tuple[str, Case, str]]:
+def by_ratio(architecture: str) -> list[tuple[str, ThesisCase, str]]:
     """Return the transient scenario with three ratios of process to measurement noise, R = P(k0) = 100."""
-    return [(f"Q/R = {name}", Case("transient", q=q), architecture) for name, q in RATIOS]
+    return [(f"Q/R = {name}", ThesisCase("transient", q=q), architecture) for name, q in RATIOS]
 
 
 def sample_run(bench: Bench) -> tuple[Panel, ...]:
@@ -247,7 +251,7 @@ def _message_distribution(architecture: str, *, cumulative: bool) -> Make:
             x = np.arange(MOST_NODES + 1)
             title = f"Local Fusion Graph, exact, steps {first}–{last}{_window(first, last)}"
             y = "cumulative probability" if cumulative else "probability"
-            curves = tuple(Curve(percent(µ), row) for µ, row in zip(links, values, strict=True))
+            curves = tuple(DrawnCurve(percent(µ), row) for µ, row in zip(links, values, strict=True))
             panels.append(
                 Panel(title, "nodes per message", y, tuple(map(str, x)), x, curves, (0.0, 1.0), bars=not cumulative)
             )
@@ -272,7 +276,7 @@ def message_sizes(rules: Sequence[str] = (LFG,)) -> Make:
         names = [(f"{RULES[rule]}, {a.replace('-', ' ')}", a, rule) for rule in rules for a in ARCHITECTURES]
         panels = []
         for first, last in (WINDOW, STATED_WINDOW):
-            curves = [Curve(name, mean_size(bench, a, rule, (first, last))) for name, a, rule in names]
+            curves = [DrawnCurve(name, mean_size(bench, a, rule, (first, last))) for name, a, rule in names]
             panels.append(
                 over_links(f"exact, steps {first}–{last}{_window(first, last)}", "mean message size [nodes]", curves)
             )
@@ -281,7 +285,7 @@ def message_sizes(rules: Sequence[str] = (LFG,)) -> Make:
     return make
 
 
-def cost_of_accuracy(case: Case) -> Make:
+def cost_of_accuracy(case: ThesisCase) -> Make:
     """Figures 61, 62: time-averaged RMS error over the mean message size."""
 
     def make(bench: Bench) -> tuple[Panel, ...]:
@@ -290,8 +294,8 @@ def cost_of_accuracy(case: Case) -> Make:
         for name, a, rule in found:
             weights, size = bench.weights(case, a, rule=rule), mean_size(bench, a, rule)
             label = f"{name}, {a.replace('-', ' ')}"
-            averaged.append(Curve(label, averaged_errors(bench, weights, case, a), at=size))
-            single.append(Curve(label, errors_of_records(bench, weights, case, a, 1)[0], at=size))
+            averaged.append(DrawnCurve(label, averaged_errors(bench, weights, case, a), at=size))
+            single.append(DrawnCurve(label, errors_of_records(bench, weights, case, a, 1)[0], at=size))
         y = f"RMS error (actual), mean over steps 2–{bench.steps}"
         return tuple(
             Panel(title, "mean message size [nodes]", y, tuple(map(percent, LINKS)), np.array(LINKS), tuple(curves))
@@ -312,7 +316,7 @@ def averaged_covariances(bench: Bench) -> dict[str, np.ndarray]:
 
 def figure_67(bench: Bench) -> tuple[Panel, ...]:
     """Figure 67: covariance averaged over time, relative to that without links."""
-    curves = [Curve(name, P / P[0]) for name, P in averaged_covariances(bench).items()]
+    curves = [DrawnCurve(name, P / P[0]) for name, P in averaged_covariances(bench).items()]
     y = f"claimed covariance, mean over steps 1–{bench.steps}, / that at 0 %"
     panel = over_links("ad hoc; Local Fusion Graph exact, simplified approximate", y, curves)
     return (Panel(panel.title, panel.x_label, y, panel.points, panel.x, panel.curves, (0.4, 1.0)),)
@@ -320,12 +324,12 @@ def figure_67(bench: Bench) -> tuple[Panel, ...]:
 
 def figure_68(bench: Bench) -> tuple[Panel, ...]:
     """Figure 68: difference of the covariances, relative to the initial covariance."""
-    curves = [Curve(case.name, covariance_difference(bench, case)) for case in (TRANSIENT, STEADY)]
+    curves = [DrawnCurve(case.name, covariance_difference(bench, case)) for case in (TRANSIENT, STEADY)]
     y = f"simplified less Local Fusion Graph, mean over steps 1–{bench.steps}, / P(k0)"
     return (over_links("ad hoc, claimed covariance", y, curves),)
 
 
-def covariance_difference(bench: Bench, case: Case) -> np.ndarray:
+def covariance_difference(bench: Bench, case: ThesisCase) -> np.ndarray:
     """Simplified less exact claimed covariance, averaged over time, in units of P(k0), (links,)."""
     found = averaged_covariances(bench)
     difference = found[f"{RULES[SIMPLIFIED]}, {case.name}"] - found[f"{RULES[LFG]}, {case.name}"]
@@ -351,7 +355,7 @@ def figure_71(bench: Bench) -> tuple[Panel, ...]:
     panels = []
     for title, one in ((BOTH_NOISE, False), (BOTH_ONE.format(bench.seed, ""), True)):
         found = relative_errors(bench, one_record=one)
-        curves = [Curve(f"{RULES[rule]}, {case}", y) for (case, rule), y in found.items()]
+        curves = [DrawnCurve(f"{RULES[rule]}, {case}", y) for (case, rule), y in found.items()]
         panels.append(over_links(f"ad hoc, {title}", f"RMS error, mean over steps 2–{bench.steps}, / 0 %", curves))
     return tuple(panels)
 
@@ -361,6 +365,6 @@ def figure_72(bench: Bench) -> tuple[Panel, ...]:
     panels = []
     for title, one in ((BOTH_NOISE, False), (BOTH_ONE.format(bench.seed, ""), True)):
         found = relative_errors(bench, one_record=one)
-        curves = [Curve(c.name, found[c.name, SIMPLIFIED] - found[c.name, LFG]) for c in (TRANSIENT, STEADY)]
+        curves = [DrawnCurve(c.name, found[c.name, SIMPLIFIED] - found[c.name, LFG]) for c in (TRANSIENT, STEADY)]
         panels.append(over_links(f"ad hoc, {title}", "simplified less Local Fusion Graph, both / 0 %", curves))
     return tuple(panels)

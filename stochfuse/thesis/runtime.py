@@ -10,6 +10,7 @@ from stochfuse import __version__
 from stochfuse.prediction.predict import predict
 from stochfuse.report.reproductions import SCHEMA
 from stochfuse.report.table import Table
+from stochfuse.scenario.registry import GENERAL, MONTE_CARLO, SIMPLIFIED
 from stochfuse.scenario.scenario import load_scenario
 
 THESIS_SIMULATION, THESIS_MODEL = 12_000.0, 2.0
@@ -52,15 +53,15 @@ def timing(*, workers: int | None = None) -> Timing:
         (
             f"{RUNS} Monte Carlo runs of the Local Fusion Graph",
             THESIS_SIMULATION,
-            {"method": "monte-carlo", "runs": RUNS},
+            {"method": MONTE_CARLO, "runs": RUNS},
         ),
-        ("simplified formulation (54)", THESIS_MODEL, {"method": "simplified"}),
-        ("general formulation (49), every outcome", None, {"method": "general"}),
+        ("simplified formulation (54)", THESIS_MODEL, {"method": SIMPLIFIED}),
+        ("general formulation (49), every outcome", None, {"method": GENERAL}),
     )
     rows = []
     for name, there, how in work:
         start = perf_counter()
-        settings: dict[str, Any] = {"workers": workers} if how["method"] == "monte-carlo" else {}
+        settings: dict[str, Any] = {"workers": workers} if how["method"] == MONTE_CARLO else {}
         predict(scenario, None, **how, **settings)
         rows.append((name, there, perf_counter() - start))
     return Timing(tuple(rows))

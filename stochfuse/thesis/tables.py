@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stochfuse.report.reproductions import Curve, Panel
+from stochfuse.report.reproductions import DrawnCurve, Panel
 from stochfuse.scenario.scenario import Scenario
 from stochfuse.thesis.bench import LINKS, STEADY, TRANSIENT, Bench, table_3_rows
 from stochfuse.thesis.figures import over_links
@@ -26,11 +26,11 @@ def table_3(bench: Bench) -> tuple[Panel, ...]:
         here = [row for row in rows if row.column == column]
         curves = []
         for moment in ("mean", "maximum", "std"):
-            curves.append(Curve(f"{moment}, thesis", np.array([float(getattr(r.thesis, moment)) for r in here])))
+            curves.append(DrawnCurve(f"{moment}, thesis", np.array([float(getattr(r.thesis, moment)) for r in here])))
             for architecture, first, last in here[0].ours:
                 found = [float(getattr(row.ours[architecture, first, last], moment)) for row in here]
                 name = f"{moment}, {architecture.replace('-', ' ')}, k={first}–{last}"
-                curves.append(Curve(name, np.array(found)))
+                curves.append(DrawnCurve(name, np.array(found)))
         title = f"the thesis' column '{column.replace('-', ' ')}', and exact values by draw and window"
         panels.append(over_links(title, "message size [nodes]", curves, [row.link for row in here]))
     return tuple(panels)

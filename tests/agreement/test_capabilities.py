@@ -16,7 +16,7 @@ import pytest
 import stochfuse as sf
 from stochfuse.scenario import capabilities, registry
 from stochfuse.scenario.scenario import link_rows
-from tests.cli.test_cli import run, strict_json
+from tests.cli.command import run, strict_json
 from tests.oracles import featured
 
 NAMES = [f.name for f in capabilities.FEATURES]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import os
 import subprocess
 import sys
@@ -15,28 +14,7 @@ import pytest
 import sympy
 
 import stochfuse as sf
-
-ENV = {key: value for key, value in os.environ.items() if key not in ("COLUMNS", "FORCE_COLOR")}
-
-
-def run(*arguments, code=0, env=None, **options):
-    done = subprocess.run(
-        [sys.executable, "-m", "stochfuse", *arguments],
-        capture_output=True,
-        text=True,
-        env={**ENV, **(env or {})},
-        **options,
-    )
-    assert done.returncode == code, done.stderr
-    assert "Traceback" not in done.stderr
-    return done
-
-
-def strict_json(text):
-    def refuse(constant):
-        raise AssertionError(f"{constant} is not JSON")
-
-    return json.loads(text, parse_constant=refuse)
+from tests.cli.command import ENV, run, strict_json
 
 
 def test_version_and_help():
@@ -386,7 +364,7 @@ def test_a_closed_pipe_is_quiet():
     assert done.stdout.startswith("method,")
 
 
-SIMPLIFIED = ["predict", "cv-2d", "--agents", "500", "--link", "0:1:0.0001", "--steps", "5000"]
+SIMPLIFIED = ["predict", "cv-2d", "--agents", "500", "--link", "0:1:0.001", "--steps", "5000"]
 GENERAL = ["predict", "--method", "general"]
 MONTE_CARLO = ["predict", "--method", "monte-carlo", "--runs", "500000", "--workers", "2"]
 

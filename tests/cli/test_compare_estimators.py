@@ -13,7 +13,7 @@ from stochfuse.cli.options import Criterion, Estimator
 from stochfuse.errors import UsageError
 from stochfuse.report.comparisons import EstimatorView, draw_estimators
 from stochfuse.scenario.registry import CRITERIA, ESTIMATORS
-from tests.cli.test_cli import run, strict_json
+from tests.cli.command import run, strict_json
 
 
 def test_the_command_line_knows_the_names():

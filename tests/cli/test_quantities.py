@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import stochfuse as sf
-from tests.cli.test_cli import run, strict_json
+from tests.cli.command import run, strict_json
 from tests.oracles.strategies import mapping
 
 BURST = {"good_to_bad": 0.1, "bad_to_good": 0.3, "good": 0.98, "bad": 0.1}

@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from tests.cli.test_cli import run, strict_json
+from tests.cli.command import run, strict_json
 
 STUDY = """
 scenario = "thesis-transient"

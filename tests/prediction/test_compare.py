@@ -9,7 +9,7 @@ import stochfuse as sf
 from stochfuse.kalman.metrics import metric
 from stochfuse.prediction.compare import compare
 from stochfuse.report import comparisons
-from stochfuse.report.predictions import View
+from stochfuse.report.predictions import PredictionView
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def test_differences_are_signed_and_from_the_reference(found):
 
 def view(found, relative=False):
     m = metric("trace", found.reference.scenario.model)
-    return comparisons.ComparisonView(found, tuple(View(p, m) for p in found.predictions), relative)
+    return comparisons.ComparisonView(found, tuple(PredictionView(p, m) for p in found.predictions), relative)
 
 
 def test_table(found):

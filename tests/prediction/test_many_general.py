@@ -346,7 +346,7 @@ def test_outcomes_are_gone_through_once():
 
 def test_different_claims_that_share_their_first_number():
     """Two sums whose first random numbers happen to be equal are told by the second."""
-    view = enumeration.View(
+    view = enumeration.FusedSet(
         np.array([[0, 1, -1]]), ((1, np.array([0, 1, 2])), (1, np.array([2, 2, 2]))), np.arange(3), np.eye(3), []
     )
     signatures = np.array([[7, 1], [7, 2], [0, 0]], dtype=np.uint64)

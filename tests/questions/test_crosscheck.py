@@ -10,7 +10,7 @@ import pytest
 import stochfuse as sf
 from stochfuse.kalman.metrics import metric
 from stochfuse.questions.crosscheck import check_results
-from stochfuse.questions.results import Results, ResultsError, read_results
+from stochfuse.questions.results import ResultsError, SimulatorResults, read_results
 
 LINKS = ["0", "0.25", "0.5", "0.75", "1"]
 STEPS = 3
@@ -33,7 +33,7 @@ def samples():
 def results(P):
     """Arrays (link, run, step, agent) as results."""
     link, run, step, agent = (i.ravel() for i in np.indices(P.shape))
-    return Results(
+    return SimulatorResults(
         "simulator",
         np.array(LINKS)[link],
         step + 1,
@@ -88,7 +88,7 @@ def test_a_small_error_everywhere_is_found_together(samples, prediction):
 def test_rare_outcomes_that_were_not_seen_are_reckoned_with():
     """At µ = 0.999 ten runs see no loss: a sample without spread, and right all the same."""
     prediction = sf.predict(sf.load_scenario(steps=1), [0.999], method="general")
-    flat = Results(
+    flat = SimulatorResults(
         "simulator", np.array(["0.999"] * 10), np.ones(10, int), np.zeros(10, int), np.full(10, 100 / 3), np.arange(10), None, None, None,
         np.arange(10), "line", 0.0,
     )  # fmt: skip
@@ -100,7 +100,7 @@ def simulated(scenario, link, runs, seed, of=lambda P: np.trace(P, axis1=-2, axi
     s = sf.predict(scenario, [link], method="monte-carlo", runs=runs, seed=seed, workers=1).sampled.sample
     P = of(s.values.P)[s.which]
     _, run, step, agent = (i.ravel() for i in np.indices(P.shape))
-    return Results(
+    return SimulatorResults(
         "simulator", np.full(P.size, str(link)), step + 1, agent + 1, P.ravel(), run, None, None, None, np.arange(P.size), "line", 0.0
     )  # fmt: skip
 

@@ -6,13 +6,13 @@ import pytest
 
 import stochfuse as sf
 from stochfuse.kalman.metrics import metric
-from stochfuse.report.predictions import View, predict_table
+from stochfuse.report.predictions import PredictionView, predict_table
 from stochfuse.report.table import Table, to_latex, to_markdown, to_text
 
 
 def table_of(preset, links=None, **options):
     s = sf.load_scenario(preset, **options)
-    return predict_table(View(sf.predict(s, links, steady=True), metric(s.metric or "trace", s.model)))
+    return predict_table(PredictionView(sf.predict(s, links, steady=True), metric(s.metric or "trace", s.model)))
 
 
 TABLES = {

@@ -440,7 +440,7 @@ def test_a_dask_cluster_of_two_workers_one_of_which_is_killed(cluster, tmp_path,
         victim = sorted(client.run(os.getpid).values())[0]
         killed = []
 
-        class KillsOne(running.Progress):
+        class KillsOne(running.StudyProgress):
             def advance(self, points: int) -> None:
                 if not killed:
                     os.kill(victim, signal.SIGKILL)

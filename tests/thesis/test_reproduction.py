@@ -15,13 +15,14 @@ from stochfuse.cli import reproduce as command
 from stochfuse.cli.app import app
 from stochfuse.errors import UsageError
 from stochfuse.report import reproductions as report
+from stochfuse.scenario.registry import LFG, NAIVE, SIMPLIFIED
 from stochfuse.thesis import Bench, about_covariance, about_errors, about_records, catalogue, find, sheet
 from stochfuse.thesis import bench as records
-from stochfuse.thesis.bench import ARCHITECTURES, LFG, LINKS, NAIVE, SIMPLIFIED, STEADY, TRANSIENT, Case
+from stochfuse.thesis.bench import ARCHITECTURES, LINKS, STEADY, TRANSIENT, ThesisCase
 from stochfuse.thesis.catalogue import NOT_COVERED, statements
 from stochfuse.thesis.figures import time_average
 from stochfuse.thesis.statements import explained, judged
-from tests.cli.test_cli import run, strict_json
+from tests.cli.command import run, strict_json
 from tests.oracles import textbook
 
 SLOW = "ad-hoc"
@@ -254,7 +255,9 @@ def test_the_initial_error_explains_figures_32_and_33(bench):
 
 def test_process_noise_shrinks_the_rise(bench):
     """Theory section 7: the bias alone gives a rise at Q/R = 1/4 and 1/16 and none at 4 (at the thesis' levels)."""
-    rises = [about_errors.averaged(bench, "broadcast", LINKS, Case("transient", q=q)) for q in (6.25, 25.0, 400.0)]
+    rises = [
+        about_errors.averaged(bench, "broadcast", LINKS, ThesisCase("transient", q=q)) for q in (6.25, 25.0, 400.0)
+    ]
     assert [r[1] > r[0] for r in rises] == [True, True, False]
 
 
@@ -358,7 +361,7 @@ def test_plots_have_the_axes_of_the_thesis(bench):
 
 def test_bands_and_abscissae_of_their_own_are_drawn_and_listed():
     y = np.array([1.0, 2.0])
-    curve = report.Curve("a", y, y - 1, y + 1, np.array([5.0, 7.0]))
+    curve = report.DrawnCurve("a", y, y - 1, y + 1, np.array([5.0, 7.0]))
     panel = report.Panel("p", "size", "error", ("0 %", "1 %"), np.array([0.0, 1.0]), (curve,))
     made = report.Sheet("figure-61", "t", panels=(panel,))
     axes = report.draw(made).axes[0]
