@@ -44,6 +44,8 @@ LISTED = 1 << 20
 """Weights of outcomes that are gone through at a time while equal claims are found."""
 MOST_WEIGHTS = 1 << 24
 """Weights of claims that are held at a time."""
+MOST_ENDINGS = 1_000_000
+"""Outcomes of the last exchange, over all states, up to which they are listed one by one."""
 WRITTEN_OUT = 10**30
 """Numbers from which on only the size is told."""
 
@@ -263,6 +265,14 @@ def _shown(number: int, short: str = ".3g") -> str:
     return f"{number:{short}}" if number < WRITTEN_OUT else f"{Decimal(number):.3g}"
 
 
+def _check_ending(states: int, events: int) -> None:
+    if states * 2.0**events > MOST_ENDINGS:
+        raise TooManyError(
+            f"the last exchange has {2.0**events:.3g} outcomes for each of {states:,} states, too many to list: use "
+            "--method monte-carlo, or fewer agents or steps"
+        )
+
+
 def _ending(
     estimator: Estimator,
     layer: dict[Any, Any],
@@ -279,6 +289,7 @@ def _ending(
         for agent in agents:
             concerned = [e._replace(receivers=(agent,)) for e in concerning(last, [agent])]
             concerned = last if estimator.joint else concerned
+            _check_ending(len(exchanges), len(concerned))
             possible = outcomes(concerned, request.agents, request.delay, 0, weights)
             ids = np.array([[x.fused(agent, o.heard) for o in possible] for x in exchanges])
             factors = weights.factors([o.factor for o in possible], len(concerned))

@@ -230,12 +230,15 @@ class Outcomes:
         UsageError
             If links differ, so that there is no single µ.
         """
+        self._require_polynomial()
+        return matrix(quantity, self.expectations[step - 1][group])
+
+    def _require_polynomial(self) -> None:
         if not self.polynomial:
             raise UsageError(
                 "a polynomial in µ: expected one link probability for all links and steps, and every outcome; got "
-                "links that differ, or outcomes left out"
+                "links that differ, none at all, or outcomes left out"
             )
-        return matrix(quantity, self.expectations[step - 1][group])
 
     def covariance(self, link: np.ndarray | None = None, quantity: str = "claimed") -> np.ndarray:
         """Expected covariance, (rows, steps, groups, d, d), at the rows or, of a polynomial, at some link
@@ -266,8 +269,8 @@ class Outcomes:
 
     def derivative(self, quantity: str = "claimed") -> np.ndarray:
         """dE[P]/dµ at the scenario's rows, (rows, steps, groups, d, d); or of another quantity's matrix."""
-        µ = self.common
-        out = []
+        self._require_polynomial()
+        µ, out = self.common, []
         for step in range(1, len(self.expectations) + 1):
             by_group = []
             for group in range(len(self.groups)):

@@ -82,6 +82,10 @@ def agents_needed(
         raise UsageError(
             "agents needed: expected like agents, got [[agent]] tables; there is no telling what one more is"
         )
+    if scenario.network.hears is not None:
+        raise UsageError(
+            "agents needed: expected everyone to hear everyone, got network.hears; there is no telling whom one more hears"
+        )
     require_like_links(scenario)
     if not 0 <= link <= 1:
         raise UsageError(f"link: expected a probability between 0 and 1, got {link:g}")
