@@ -298,11 +298,12 @@ def _filter(system: System) -> Filter:
 
 def _stacked(blocks: Sequence[np.ndarray], steps: int) -> np.ndarray:
     """Block diagonal matrix, per step where one of the blocks is."""
-    from scipy.linalg import block_diag
-
-    if any(block.ndim > 2 for block in blocks):
-        return np.array([block_diag(*(at_step(block, step) for block in blocks)) for step in range(1, steps + 1)])
-    return np.asarray(block_diag(*blocks))
+    times = (steps,) if any(block.ndim > 2 for block in blocks) else ()
+    ends = np.cumsum([(0, 0), *(block.shape[-2:] for block in blocks)], axis=0)
+    out = np.zeros((*times, *ends[-1]))
+    for block, (row, column), (end, last) in zip(blocks, ends, ends[1:], strict=False):
+        out[..., row:end, column:last] = block[:steps] if block.ndim > 2 else block
+    return out
 
 
 def moments(estimate: Estimate | Moments) -> Moments:

@@ -11,7 +11,7 @@ true as far as f and h are straight over the spread of the errors.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,7 +22,32 @@ STEP = float(np.cbrt(np.finfo(float).eps))
 """Step of a central difference in units of the state's size: errors of rounding and of curvature are then alike."""
 
 Function = Callable[[np.ndarray], np.ndarray]
-AtStep = Callable[[np.ndarray, int], np.ndarray]
+
+
+class NonlinearModel(NamedTuple):
+    """What the filter is told of a motion and a sensor.
+
+    Parameters
+    ----------
+    f, h : transition and measurement as functions of the state, columns to columns; for `extended_filter` of the state
+        and of the step (counted from 1) that they lead to.
+    F, H : their Jacobians, functions of the same; by central differences where None.
+    residual : innovation of z and h(x̂⁻); their difference by default.  Angles need one that wraps.
+    """
+
+    f: Callable[..., np.ndarray]
+    h: Callable[..., np.ndarray]
+    F: Callable[..., np.ndarray] | None = None
+    H: Callable[..., np.ndarray] | None = None
+    residual: Callable[[np.ndarray, np.ndarray], np.ndarray] = np.subtract
+
+    def at(self, step: int) -> NonlinearModel:
+        """Return the functions of the state alone that lead to a step."""
+
+        def there(g: Callable[..., np.ndarray] | None) -> Any:
+            return None if g is None else lambda x: g(x, step)
+
+        return NonlinearModel(there(self.f), there(self.h), there(self.F), there(self.H), self.residual)
 
 
 class Track(NamedTuple):
@@ -51,26 +76,16 @@ def jacobian(f: Function, x: np.ndarray) -> np.ndarray:
 
 
 def extended_step(
-    estimate: Estimate,
-    f: Function,
-    F: Function | None,
-    Q: np.ndarray,
-    h: Function,
-    H: Function | None,
-    R: np.ndarray,
-    z: np.ndarray | None,
-    residual: Callable[[np.ndarray, np.ndarray], np.ndarray] = np.subtract,
+    estimate: Estimate, model: NonlinearModel, Q: np.ndarray, R: np.ndarray, z: np.ndarray | None
 ) -> Estimate:
     """Predict, and take in a measurement where there is one.
 
     Parameters
     ----------
     estimate : x (..., d, 1) and P (..., d, d) after the previous step.
-    f, h : transition and measurement as functions of the state, columns to columns.
-    F, H : their Jacobians as functions of the state; by central differences where None.
+    model : transition and measurement as functions of the state.
     Q, R : process and measurement noise covariances, (..., d, d) and (..., p, p).
     z : (..., p, 1) measurement, None where nothing arrived.
-    residual : innovation of z and h(x̂⁻); their difference by default.  Angles need one that wraps.
 
     Returns
     -------
@@ -83,6 +98,7 @@ def extended_step(
         If the innovation does not fit R.
     """
     x, P = estimate
+    f, h, F, H, residual = model
     prior = Estimate(f(x), predict(Estimate(None, P), jacobian(f, x) if F is None else F(x), Q).P)
     if z is None:
         return prior
@@ -97,17 +113,7 @@ def extended_step(
     return Estimate(prior.x + error.x, error.P)
 
 
-def extended_filter(
-    start: Estimate,
-    f: AtStep,
-    F: AtStep | None,
-    Q: np.ndarray,
-    h: AtStep,
-    H: AtStep | None,
-    R: np.ndarray,
-    z: np.ndarray,
-    residual: Callable[[np.ndarray, np.ndarray], np.ndarray] = np.subtract,
-) -> Track:
+def extended_filter(start: Estimate, model: NonlinearModel, Q: np.ndarray, R: np.ndarray, z: np.ndarray) -> Track:
     """Run the extended filter over a record of measurements.
 
     Step 1 holds the first estimate; from step 2 on predict, update.
@@ -115,10 +121,9 @@ def extended_filter(
     Parameters
     ----------
     start : the estimate of step 1, x (..., d, 1) and P (..., d, d).
-    f, F, h, H : as for `extended_step`, each a function of the state and of the step (counted from 1) that it leads to.
+    model : its functions are of the state and of the step (counted from 1) that they lead to.
     Q, R : constant, or per step with the step on the first axis.
     z : (steps, ..., p, 1) record; the entry of step 1 is not used, and a step whose entries are all NaN had none.
-    residual : as for `extended_step`.
 
     Returns
     -------
@@ -140,14 +145,10 @@ def extended_filter(
         estimates.append(
             extended_step(
                 estimates[-1],
-                lambda x, k=step: f(x, k),
-                None if F is None else lambda x, k=step: F(x, k),
+                model.at(step),
                 at_step(Q, step),
-                lambda x, k=step: h(x, k),
-                None if H is None else lambda x, k=step: H(x, k),
                 at_step(R, step),
                 None if missing.all() else measured,
-                residual,
             )
         )
     P = np.broadcast_arrays(*(estimate.P for estimate in estimates))

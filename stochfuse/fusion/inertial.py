@@ -84,14 +84,12 @@ class ImuGrade:
         *,
         angle_random_walk: float,
         velocity_random_walk: float,
-        gyro_bias: float,
-        gyro_instability: float,
-        gyro_time: float,
-        accelerometer_bias: float,
-        accelerometer_instability: float,
-        accelerometer_time: float,
+        gyro: tuple[float, float, float],
+        accelerometer: tuple[float, float, float],
     ) -> ImuGrade:
-        """Take the units of data sheets: °/√h, m/s/√h, °/h (both), s, mg (both), s."""
+        """Take the units of data sheets: °/√h, m/s/√h; bias, instability and its time in °/h, °/h, s and mg, mg, s."""
+        gyro_bias, gyro_instability, gyro_time = gyro
+        accelerometer_bias, accelerometer_instability, accelerometer_time = accelerometer
         per_hour, milli_g = np.deg2rad(1.0) / 3600.0, STANDARD_GRAVITY / 1000.0
         return cls(
             angle_random_walk=float(np.deg2rad(angle_random_walk)) / 60.0,
@@ -108,12 +106,8 @@ class ImuGrade:
 TACTICAL = ImuGrade.from_data_sheet(
     angle_random_walk=0.125,
     velocity_random_walk=0.0198,
-    gyro_bias=1.0,
-    gyro_instability=0.1,
-    gyro_time=3600.0,
-    accelerometer_bias=1.0,
-    accelerometer_instability=0.1,
-    accelerometer_time=3600.0,
+    gyro=(1.0, 0.1, 3600.0),
+    accelerometer=(1.0, 0.1, 3600.0),
 )
 """A ring-laser tactical-grade unit, Honeywell HG1700.
 

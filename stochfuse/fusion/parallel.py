@@ -104,34 +104,30 @@ def parallel_filters(
             prior = predict(Estimate(None, joint[k - 1, own, own]), parts["F"][i][k], parts["Q"][i][k]).P
             gains[i][k] = _gain(i, k, prior, parts["H"][i][k], parts["R"][i][k])
         K = _blocks([g[k : k + 1] for g in gains])[0]
-        joint[k] = NUMPY.symmetric(cross_covariance(joint[k - 1], F[k], F[k], Q[k], K, H[k], K, H[k], R[k]))
+        joint[k] = NUMPY.symmetric(cross_covariance(joint[k - 1], (F[k], F[k]), Q[k], (K, K), (H[k], H[k]), R[k]))
     return ParallelFilters(joint, tuple(gains), M, np.concatenate(parts["s"], axis=-2))
 
 
-def cross_covariance(
-    P12: np.ndarray,
-    F1: np.ndarray,
-    F2: np.ndarray,
-    Q12: np.ndarray,
-    K1: np.ndarray,
-    H1: np.ndarray,
-    K2: np.ndarray,
-    H2: np.ndarray,
-    R12: np.ndarray,
-) -> np.ndarray:
+Pair = tuple[np.ndarray, np.ndarray]
+"""A matrix of the one filter, and of the other."""
+
+
+def cross_covariance(P12: np.ndarray, F: Pair, Q12: np.ndarray, K: Pair, H: Pair, R12: np.ndarray) -> np.ndarray:
     """Carry the cross-covariance of two filters' errors through one step, prediction and update.
 
     Parameters
     ----------
     P12 : (..., d_1, d_2) after the previous step.
-    F1, F2, Q12 : transitions and the process noises' cross-covariance (..., d_1, d_2).
-    K1, H1, K2, H2, R12 : gains, measurement matrices, and the measurement noises' cross-covariance (..., p_1, p_2).
+    F, Q12 : transitions (F_1, F_2) and the process noises' cross-covariance (..., d_1, d_2).
+    K, H, R12 : gains (K_1, K_2), measurement matrices (H_1, H_2), and the measurement noises' cross-covariance
+        (..., p_1, p_2).
 
     Returns
     -------
     numpy.ndarray
         (..., d_1, d_2) after the update.  With F1 = F2 = F and so on, a filter's own covariance for any gain.
     """
+    (F1, F2), (K1, K2), (H1, H2) = F, K, H
     A1, A2 = NUMPY.identity_like(K1) - K1 @ H1, NUMPY.identity_like(K2) - K2 @ H2
     prior = F1 @ P12 @ NUMPY.transpose(F2) + Q12
     return A1 @ prior @ NUMPY.transpose(A2) + K1 @ R12 @ NUMPY.transpose(K2)

@@ -84,7 +84,8 @@ def agents_needed(
         )
     if scenario.network.hears is not None:
         raise UsageError(
-            "agents needed: expected everyone to hear everyone, got network.hears; there is no telling whom one more hears"
+            "agents needed: expected everyone to hear everyone, got network.hears; there is no telling whom one more "
+            "would hear"
         )
     require_like_links(scenario)
     if not 0 <= link <= 1:

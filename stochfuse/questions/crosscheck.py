@@ -30,6 +30,8 @@ from math import erfc, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize_scalar
+from scipy.special import chdtrc, fdtrc, stdtr
 
 from stochfuse.engines.distribution import Distribution
 from stochfuse.errors import UsageError
@@ -264,8 +266,6 @@ def _judged(cell: Cell, known: _Known | None, metric: Metric, resolution: float)
     beyond = float(np.copysign(max(0.0, abs(difference) - given), difference))
     z = beyond / error if error > 0 else 0.0 if beyond == 0 else float(np.copysign(np.inf, beyond))
     if known is None:
-        from scipy.special import stdtr
-
         p = 2.0 * float(stdtr(cell.runs - 1, -abs(z)))
     else:
         skewness = abs(float(known.skewness[cell.row, cell.step - 1]))
@@ -277,8 +277,6 @@ def _judged(cell: Cell, known: _Known | None, metric: Metric, resolution: float)
 
 def _chernoff(known: _Known, metric: Metric, cell: Cell, mean: float) -> float:
     """Chernoff's bound on the probability that the mean of independent runs is as far off on either side."""
-    from scipy.optimize import minimize_scalar
-
     rows = slice(cell.row, cell.row + 1)
     spread = known.outcomes.distribution(metric, cell.step, [known.group], rows)
     probability = spread.probability[0]
@@ -301,8 +299,6 @@ def _together(
     cells: Sequence[Cell], samples: Sequence[tuple[np.ndarray, np.ndarray]], skewed: Sequence[float]
 ) -> float | None:
     """Hotelling's T² of a link's cells over the runs that they share: its p-value, None if there are too few runs."""
-    from scipy.special import fdtrc
-
     fit = [
         i
         for i, cell in enumerate(cells)
@@ -327,8 +323,6 @@ def _together(
 
 
 def _chi_squared_tail(statistic: float, freedom: int) -> float:
-    from scipy.special import chdtrc
-
     return float(chdtrc(freedom, statistic))
 
 

@@ -38,6 +38,7 @@ from functools import partial
 from math import comb, isfinite
 from typing import Any, NamedTuple
 
+import mpmath
 import numpy as np
 
 from stochfuse.engines.events import bernstein
@@ -188,8 +189,6 @@ def refinable(asked: Question) -> bool:
 
 def refined(asked: Question, target: float, enclosure: tuple[float, float]) -> tuple[float, tuple[float, float]] | None:
     """Return the crossing of the target within an enclosure, and what encloses it now; None if it is not in there."""
-    import mpmath
-
     with mpmath.workdps(DIGITS):
         gap = lambda µ: expected(asked, µ) - mpmath.mpf(target)  # noqa: E731
         low, high = map(mpmath.mpf, enclosure)
@@ -202,8 +201,6 @@ def refined(asked: Question, target: float, enclosure: tuple[float, float]) -> t
 
 def expected(asked: Question, µ: Any) -> Any:
     """E(µ) of (54) at the step asked about, in mpmath's working precision."""
-    import mpmath
-
     scenario = asked.scenario
     senders = number_of_senders(scenario.network.architecture, scenario.network.agents)
     µ = mpmath.mpf(µ)
@@ -220,8 +217,6 @@ def expected(asked: Question, µ: Any) -> Any:
 
 
 def _precise(A: np.ndarray) -> np.ndarray:
-    import mpmath
-
     return np.array([[mpmath.mpf(float(a)) for a in row] for row in A], dtype=object)
 
 

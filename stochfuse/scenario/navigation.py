@@ -104,7 +104,17 @@ def read_navigation(check: Checker, table: Mapping[str, Any], steps: int) -> Err
     except UsageError as reason:
         check.note("navigation.leg", "a way that a vehicle can take", f"({reason})")
         return None
-    return error_model(path, ImuGrade.from_data_sheet(**imu), initial, steps, ticks)
+    grade = ImuGrade.from_data_sheet(
+        angle_random_walk=imu["angle_random_walk"],
+        velocity_random_walk=imu["velocity_random_walk"],
+        gyro=_drift(imu, "gyro"),
+        accelerometer=_drift(imu, "accelerometer"),
+    )
+    return error_model(path, grade, initial, steps, ticks)
+
+
+def _drift(imu: Mapping[str, float], sensor: str) -> tuple[float, float, float]:
+    return imu[f"{sensor}_bias"], imu[f"{sensor}_instability"], imu[f"{sensor}_time"]
 
 
 def _table(table: Mapping[str, Any], key: str) -> Mapping[str, Any]:

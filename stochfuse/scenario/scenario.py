@@ -14,7 +14,9 @@ with "shared" all agents start from one common estimate.
 from __future__ import annotations
 
 import copy
+import json
 import sys
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -254,12 +256,8 @@ def parse(name: str, text: str, help: str = "`stochfuse scenario new`") -> dict[
     """Parse TOML, or JSON if the text begins with a brace; `help` is what an empty text's author should see."""
     try:
         if text.lstrip("\ufeff \t\r\n").startswith("{") or name.lower().endswith(".json"):
-            import json
-
             mapping = json.loads(text.lstrip("\ufeff"))
         else:
-            import tomllib
-
             mapping = tomllib.loads(text.lstrip("\ufeff"))
     except RecursionError:
         raise ScenarioError(name, "nested too deeply") from None

@@ -33,6 +33,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 
 from stochfuse import __version__
 from stochfuse.errors import Problem, ScenarioError, StochfuseError, UsageError
@@ -56,8 +57,6 @@ MOST_DRAWN = 20_000_000
 
 def software() -> dict[str, str]:
     """Versions on which the last bits of results depend."""
-    import scipy
-
     return {"stochfuse": __version__, "numpy": np.__version__, "scipy": scipy.__version__}
 
 

@@ -239,10 +239,10 @@ def test_cross_covariance_is_that_of_the_joint_recursion():
     P12, K1, K2 = P0_cross[0, 1], run.gains[0][1], run.gains[1][1]
     for k in range(1, 4):
         K1, K2 = run.gains[0][k], run.gains[1][k]
-        P12 = cross_covariance(P12, full.F, short.F, Q_cross[0, 1], K1, full.H, K2, short.H, R_cross[1, 0].T)
+        P12 = cross_covariance(P12, (full.F, short.F), Q_cross[0, 1], (K1, K2), (full.H, short.H), R_cross[1, 0].T)
         np.testing.assert_allclose(run.joint[k, :2, 2:], P12, rtol=1e-12)
     batch = cross_covariance(
-        np.stack([P12, P12]), full.F, short.F, Q_cross[0, 1], K1, full.H, K2, short.H, R_cross[1, 0].T
+        np.stack([P12, P12]), (full.F, short.F), Q_cross[0, 1], (K1, K2), (full.H, short.H), R_cross[1, 0].T
     )
     assert batch.shape == (2, 2, 1)
 

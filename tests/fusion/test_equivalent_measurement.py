@@ -16,7 +16,7 @@ from stochfuse.fusion.equivalent_measurement import (
     independent_measurement,
     worst_error,
 )
-from stochfuse.fusion.extended import extended_filter, extended_step, jacobian
+from stochfuse.fusion.extended import NonlinearModel, extended_filter, extended_step, jacobian
 from stochfuse.kalman.kernel import Estimate
 from tests.oracles import textbook
 from tests.oracles.strategies import covariance, seeds
@@ -232,7 +232,7 @@ def test_linear_functions_give_the_kalman_filter():
         prior = textbook.kalman_predict(P, F, Q)
         x, P = textbook.kalman_state(F @ x, prior, H, R, measured), textbook.kalman_update(prior, H, R)
     for jacobians in ((lambda x, k: F, lambda x, k: H), (None, None)):
-        track = extended_filter(start, lambda x, k: F @ x, jacobians[0], Q, lambda x, k: H @ x, jacobians[1], R, z)
+        track = extended_filter(start, NonlinearModel(lambda x, k: F @ x, lambda x, k: H @ x, *jacobians), Q, R, z)
         np.testing.assert_allclose(track.x[-1], x, atol=1e-9)
         np.testing.assert_allclose(track.P[-1], P, atol=1e-9)
         np.testing.assert_allclose(track.x[-1].ravel(), [5.116244352839, 1.045095743855], atol=1e-9)
@@ -241,18 +241,18 @@ def test_linear_functions_give_the_kalman_filter():
 def test_nothing_arrived_leaves_the_prediction_and_half_a_measurement_is_refused():
     start = Estimate(np.ones((2, 1)), np.eye(2))
     got = extended_step(
-        start, lambda x: x**2, lambda x: np.diag(2 * x[:, 0]), np.eye(2), lambda x: x, None, np.eye(2), None
+        start, NonlinearModel(lambda x: x**2, lambda x: x, lambda x: np.diag(2 * x[:, 0])), np.eye(2), np.eye(2), None
     )
     np.testing.assert_array_equal(got.x, start.x)
     np.testing.assert_array_equal(got.P, 5 * np.eye(2))
     z = np.full((3, 2, 1), np.nan)
-    track = extended_filter(start, lambda x, k: k * x, None, 0 * np.eye(2), lambda x, k: x, None, np.eye(2), z)
+    track = extended_filter(start, NonlinearModel(lambda x, k: k * x, lambda x, k: x), 0 * np.eye(2), np.eye(2), z)
     np.testing.assert_allclose(track.x[:, 0, 0], [1, 2, 6])
     z[2, 0] = 1.0
     with pytest.raises(UsageError, match="z: expected at step 3 all entries or all NaN, got 1 NaN of 2"):
-        extended_filter(start, lambda x, k: x, None, np.eye(2), lambda x, k: x, None, np.eye(2), z)
+        extended_filter(start, NonlinearModel(lambda x, k: x, lambda x, k: x), np.eye(2), np.eye(2), z)
     with pytest.raises(UsageError, match="z: expected a column of 1 rows as R has, got an innovation of 2×1"):
-        extended_step(start, lambda x: x, None, np.eye(2), lambda x: x, None, np.eye(1), np.ones((2, 1)))
+        extended_step(start, NonlinearModel(lambda x: x, lambda x: x), np.eye(2), np.eye(1), np.ones((2, 1)))
 
 
 def transition(x, step):
@@ -297,6 +297,9 @@ def squared(track, states):
     return (np.swapaxes(error, -1, -2) @ np.linalg.solve(track.P, error))[..., 0, 0]
 
 
+PENDULUM = NonlinearModel(transition, range_bearing, residual=wrapped)
+
+
 def test_jacobian_of_a_stack():
     x = np.random.default_rng(15).normal(size=(5, 2, 1))
     got = jacobian(lambda x: transition(x, 1), x)
@@ -310,12 +313,12 @@ def test_a_pendulum_seen_by_range_and_bearing_is_consistent():
     first, states = truth(rng)
     z = range_bearing(states, 0) + np.linalg.cholesky(NOISE) @ rng.normal(size=states.shape)
     z[:, :, 1, :] = (z[:, :, 1, :] + np.pi) % (2 * np.pi) - np.pi
-    track = extended_filter(first, transition, None, Q, range_bearing, None, NOISE, z, wrapped)
+    track = extended_filter(first, PENDULUM, Q, NOISE, z)
     mean = squared(track, states).mean(axis=1)
     low, high = chi2.ppf([0.001 / STEPS, 1 - 0.001 / STEPS], 2 * RUNS) / RUNS
     assert low < mean.min()
     assert mean.max() < high
-    blind = extended_filter(first, transition, None, Q, range_bearing, None, NOISE, np.full_like(z, np.nan), wrapped)
+    blind = extended_filter(first, PENDULUM, Q, NOISE, np.full_like(z, np.nan))
     assert (track.P[-1].trace(axis1=-2, axis2=-1) < 0.5 * blind.P[-1].trace(axis1=-2, axis2=-1)).all()
 
 
@@ -337,7 +340,7 @@ def test_equivalent_measurement_inside_the_filter_against_independent_fusion():
         ("equivalent", equivalent_measurement(R, 2, D)),
         ("independent", independent_measurement(R, 2)),
     ):
-        track = extended_filter(first, transition, None, Q, sight, None, fused.R, fused.weights @ z)
+        track = extended_filter(first, NonlinearModel(transition, sight), Q, fused.R, fused.weights @ z)
         error = states - track.x
         ratio[name] = (error[5:, :, 0, 0] ** 2).mean() / track.P[5:, ..., 0, 0].mean()
         mean = squared(track, states)[5:].mean()
