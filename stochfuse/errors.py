@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from difflib import get_close_matches
 from typing import NamedTuple
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """Return ` (did you mean 'claimed'?)` where one of the known words is near, else nothing."""
+    found = get_close_matches(word, list(known), n=1)
+    return f" (did you mean '{found[0]}'?)" if found else ""
 
 
 class Problem(NamedTuple):

@@ -11,8 +11,10 @@ import typer
 from typer.core import TyperGroup
 
 from stochfuse import __version__
+from stochfuse.cli.help import Command
+from stochfuse.cli.options import gathered
 from stochfuse.cli.progress import shown
-from stochfuse.errors import NoAnswerError, ScenarioError, StochfuseError, UsageError
+from stochfuse.errors import NoAnswerError, ScenarioError, StochfuseError, UsageError, nearest
 
 COMMANDS = (
     "predict",
@@ -26,12 +28,29 @@ COMMANDS = (
     "study",
     "scenario",
     "methods",
+    "explain",
+    "doctor",
 )
 """Each has a module in `stochfuse.cli`, with a function of the same name, or with an `app` of its own commands."""
 
 WRONG_WORDS: type[Exception] = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
 """What is raised for words that are no command line; Typer brings its own click, or uses the one that is installed."""
 EXIT_FAILURE, EXIT_USAGE, EXIT_NO_ANSWER, EXIT_INTERRUPTED = 1, 2, 3, 130
+START = """\
+How good will the fused estimate be, as a function of the link probability?
+  stochfuse predict                   a first table; --agents, --link, --steps and more change it
+  stochfuse scenario new -o my.toml   a scenario of your own, with comments: stochfuse predict my.toml
+  stochfuse solve --target 30         backwards: the link probability that a variance of 30 needs
+  stochfuse --help                    all commands; stochfuse explain claimed: what a word means"""
+
+
+def built(function: Any, name: str, examples: Any = ()) -> Any:
+    """Return a function as a command with grouped options."""
+    own = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+    own.command(name, cls=Command)(gathered(function))
+    command = typer.main.get_command(own)
+    command.name, command.examples = name, examples  # type: ignore[attr-defined]
+    return command
 
 
 class Commands(TyperGroup):
@@ -47,17 +66,28 @@ class Commands(TyperGroup):
             return None
         module = import_module(f"stochfuse.cli.{cmd_name}")
         own = getattr(module, "app", None)
-        if own is None:
-            own = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-            own.command(cmd_name)(getattr(module, cmd_name))
-        command = typer.main.get_command(own)
-        command.name = cmd_name
-        return command
+        if own is not None:
+            command = typer.main.get_command(own)
+            command.name = cmd_name
+            return command
+        return built(getattr(module, cmd_name), cmd_name, getattr(module, "EXAMPLES", ()))
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find the command, and name the nearest where there is none."""
+        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
+            raise UsageError(f"no command '{args[0]}'{nearest(args[0], COMMANDS)}; commands: {', '.join(COMMANDS)}")
+        return super().resolve_command(ctx, args)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Take --debug wherever it stands."""
+        """Take --debug and --cite wherever they stand."""
         ctx.obj = "--debug" in args
-        return super().parse_args(ctx, [word for word in args if word != "--debug"] if ctx.obj else args)
+        words = [word for word in args if word != "--debug"]
+        if "--cite" in words:
+            from stochfuse.report.citations import cited
+
+            typer.echo(cited(words), nl=False)
+            ctx.exit()
+        return super().parse_args(ctx, words)
 
     def invoke(self, ctx: Any) -> Any:
         """Run the chosen command."""
@@ -103,7 +133,7 @@ def _fail(message: str, code: int) -> None:
 
 app = typer.Typer(
     cls=Commands,
-    no_args_is_help=True,
+    invoke_without_command=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -118,13 +148,18 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def options(
+    ctx: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and stop.")
+    ] = False,
+    cite: Annotated[
+        bool, typer.Option("--cite", help="Print BibTeX: this software, the thesis, and the --estimator's sources.")
     ] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show where an internal error happened.")] = False,
 ) -> None:
     """How good will the fused estimate be, as a function of the link probability?
 
     Expected covariance of distributed Kalman fusion over links that lose messages, computed instead of simulated.
-    Try: stochfuse predict
     """
+    if ctx.invoked_subcommand is None:
+        typer.echo(START)

@@ -3,145 +3,127 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
 from stochfuse.cli.options import (
+    RARE,
+    SHOWN,
+    WORK,
     AgentOption,
-    AgentsOption,
-    ArchitectureOption,
-    CriterionOption,
-    DigitsOption,
-    Format,
-    FormatOption,
-    LinkOption,
-    MaxGraphsOption,
+    AtOption,
+    Changes,
+    Graphs,
     MetricOption,
-    OutputOption,
-    P0Option,
-    PlotOption,
-    PruneOption,
-    QOption,
-    ROption,
-    RunsOption,
+    Sampling,
     ScenarioArgument,
-    SeedOption,
-    StepsOption,
-    WorkersOption,
-    check_files,
+    Weighing,
+    Written,
     check_memory,
-    chosen_format,
-    load,
+    completed,
+    option,
     quantity_names,
     settings_for,
+    steps_at,
     whose,
-    write_report,
 )
+from stochfuse.errors import UsageError
+from stochfuse.scenario.registry import ESTIMATORS, GENERAL, INTERSECTIONS, METHODS, MONTE_CARLO, NAIVE, SIMPLIFIED
 
 if TYPE_CHECKING:
     from stochfuse.kalman.metrics import Metric
     from stochfuse.scenario.scenario import Scenario
 
+ALL = "all"
+DEFAULT = (GENERAL, SIMPLIFIED, NAIVE, MONTE_CARLO)
+EXAMPLES = (
+    "stochfuse compare --methods general,simplified --link 0.5 --relative",
+    "stochfuse compare --estimator naive,split-ci,optimal --link 0.2,0.8 --steps 3",
+)
+
 
 def compare(
     scenario: ScenarioArgument = "thesis-transient",
+    changes: Changes = Changes(),
     methods: Annotated[
         str | None,
-        typer.Option(
+        option(
+            f"Of {', '.join(METHODS)}; default: {', '.join(DEFAULT)}. With several estimators one.",
+            WORK,
             metavar="LIST",
-            help="Methods to compare: simplified, general, optimal, naive, monte-carlo; default: all but optimal. With "
-            "several estimators one, general or monte-carlo; default: general where that is easy.",
+            autocompletion=completed(METHODS),
         ),
     ] = None,
     reference: Annotated[
-        str | None, typer.Option(metavar="METHOD", help="What the others are compared with; default: the most exact.")
+        str | None, option("What the others are compared with; default: the most exact.", WORK + RARE, metavar="METHOD")
     ] = None,
-    agents: AgentsOption = None,
-    steps: StepsOption = None,
-    link: LinkOption = None,
-    q: QOption = None,
-    r: ROption = None,
-    p0: P0Option = None,
-    architecture: ArchitectureOption = None,
     estimator: Annotated[
         str | None,
-        typer.Option(
+        option(
+            "Compare these estimators instead (stochfuse methods), what each claims beside what is true; all: those "
+            "that the scenario takes. One, with --methods: what these average.",
+            WORK,
             metavar="LIST",
-            help="Compare these estimators instead, what each claims beside what is true: local-fusion-graph, naive, "
-            "optimal, covariance-intersection, split-ci, blender, joint-blender, equivalent-measurement, "
-            "independent-measurements, lwin, itns, stand-alone; all: those that the scenario takes. One, with "
-            "--methods: what the methods general and monte-carlo average.",
+            autocompletion=completed((*ESTIMATORS, ALL)),
         ),
     ] = None,
     quantity: Annotated[
         str | None,
-        typer.Option(
+        option(
+            "claimed, actual, consistency, bias or rms; default: claimed, of estimators claimed,actual,consistency.",
+            SHOWN,
             metavar="NAME",
-            help="claimed, actual, consistency (actual / claimed), bias or rms; default: claimed, of estimators "
-            "claimed,actual,consistency.",
         ),
     ] = None,
     metric: MetricOption = None,
     agent: AgentOption = None,
-    all_steps: Annotated[
-        bool, typer.Option("--all-steps", help="With several estimators: a row for every step, not only the last.")
-    ] = False,
-    relative: Annotated[bool, typer.Option("--relative", help="Differences in per cent of the reference.")] = False,
-    max_graphs: MaxGraphsOption = None,
-    prune: PruneOption = False,
-    runs: RunsOption = None,
-    seed: SeedOption = None,
-    workers: WorkersOption = None,
-    criterion: CriterionOption = None,
-    digits: DigitsOption = 5,
-    format: FormatOption = None,
-    output: OutputOption = None,
-    plot: PlotOption = None,
+    at: AtOption = None,
+    all_steps: Annotated[bool, option("Estimators: every step, not only the last.", SHOWN, "--all-steps")] = False,
+    relative: Annotated[bool, option("Differences in per cent of the reference.", SHOWN, "--relative")] = False,
+    sampling: Sampling = Sampling(),
+    graphs: Graphs = Graphs(),
+    weighing: Weighing = Weighing(),
+    to: Written = Written(),
 ) -> None:
     """Show what methods predict side by side, and the signed differences; or what estimators claim and achieve.
 
     simplified is approximate, general and naive are exact averages over every outcome (naive of a rule that counts
     shared information twice), monte-carlo is sampled, with its standard error.
     """
-    from stochfuse.errors import UsageError
     from stochfuse.kalman.metrics import metric as metric_of
-    from stochfuse.scenario.registry import INTERSECTIONS
 
-    check_files(output, plot, scenario)
-    given, links = load(scenario, agents, steps, architecture, q, r, p0, link)
-    check_memory(given, links, chosen_format(format, output))
+    to.check(scenario)
+    given, links = changes.of(scenario)
+    check_memory(given, links, to.kind)
     names = None if estimator is None else _names(estimator)
     if names is None and methods is None and given.estimator is not None:
-        names = ["all"]  # a scenario for other estimators than those of the thesis' methods
-    several = names is not None and (len(names) > 1 or methods is None or names == ["all"])
-    ways = ["general", "simplified", "naive", "monte-carlo"] if methods is None else _names(methods)
+        names = [ALL]  # a scenario for other estimators than those of the thesis' methods
+    several = names is not None and (len(names) > 1 or methods is None or names == [ALL])
+    ways = list(DEFAULT) if methods is None else _names(methods)
     if several and methods is not None and len(ways) > 1:
         raise UsageError(f"--methods: expected one with several estimators, got {methods}")
+    criterion = weighing.criterion
     settings = settings_for(
-        ["general", "monte-carlo"] if several and methods is None else ways,
+        [GENERAL, MONTE_CARLO] if several and methods is None else ways,
         estimator=None if several or names is None else _known(names[0]),
-        max_graphs=max_graphs,
-        prune=prune,
-        runs=runs,
-        seed=seed,
-        workers=workers,
-        criterion=criterion,
+        **sampling._asdict(),
+        **graphs._asdict(),
+        **weighing._asdict(),
     )
-    for option, given_at_all in (("--reference", reference is not None), ("--relative", relative)):
+    for flag, given_at_all in (("--reference", reference is not None), ("--relative", relative)):
         if several and given_at_all:
-            raise UsageError(f"{option}: expected methods to compare, got several estimators")
-    if criterion is not None and several and names != ["all"] and not set(names or ()) & set(INTERSECTIONS):
+            raise UsageError(f"{flag}: expected methods to compare, got several estimators")
+    if criterion is not None and several and names != [ALL] and not set(names or ()) & set(INTERSECTIONS):
         raise UsageError(f"--criterion: expected estimator {' or '.join(INTERSECTIONS)}, got {estimator}")
     if all_steps and not several:
         raise UsageError("--all-steps: expected several estimators")
     quantities = quantity_names(quantity or ("claimed,actual,consistency" if several else "claimed"))
     chosen, chosen_agent = metric_of(metric or given.metric or "trace", given.model), whose(agent, given)
-    shown = _Shown(chosen, chosen_agent, digits, format, output, plot)
+    steps = steps_at(at, given)
+    shown = _Shown(chosen, chosen_agent, steps, to)
     if several:
-        only = None if names == ["all"] else names
+        only = None if names == [ALL] else names
         _estimators(shown, given, links, only, None if methods is None else ways[0], quantities, all_steps, settings)
     else:
         if len(quantities) > 1:
@@ -155,7 +137,6 @@ def _names(text: str) -> list[str]:
 
 def _known(estimator: str) -> str:
     from stochfuse.prediction.predict import choose
-    from stochfuse.scenario.registry import ESTIMATORS
 
     choose("estimator", estimator, ESTIMATORS)
     return estimator
@@ -166,10 +147,8 @@ class _Shown(NamedTuple):
 
     metric: Metric
     agent: int | str
-    digits: int
-    format: Format | None
-    output: Path | None
-    plot: Path | None
+    steps: tuple[int, ...] | None
+    to: Written
 
 
 def _methods(
@@ -187,22 +166,15 @@ def _methods(
     from stochfuse.report.predictions import PredictionView
 
     found = run(scenario, links, methods, reference, quantity, **settings)
-    view = comparisons.ComparisonView(
-        found, tuple(PredictionView(p, how.metric, how.agent, None, how.digits) for p in found.predictions), relative
+    views = tuple(
+        PredictionView(p, how.metric, how.agent, digits=how.to.digits, at=how.steps) for p in found.predictions
     )
+    view = comparisons.ComparisonView(found, views, relative)
     view.values()
     for prediction in found.predictions:
         for note in prediction.notes:
             typer.echo(f"note: {prediction.method}: {note}", err=True)
-    if how.plot is not None:
-        comparisons.plot_comparison(view, how.plot)
-    write_report(
-        how.format,
-        how.output,
-        partial(comparisons.compare_table, view),
-        partial(comparisons.compare_csv, view),
-        partial(comparisons.compare_json, view),
-    )
+    how.to.write(comparisons.comparison_report(view))
 
 
 def _estimators(
@@ -222,7 +194,7 @@ def _estimators(
     for name in quantities:
         check(name, how.metric)
     found = run(scenario, links, names, method, quantities=quantities, **settings)
-    view = estimators.EstimatorView(found, how.metric, how.agent, how.digits, quantities, all_steps)
+    view = estimators.EstimatorView(found, how.metric, how.agent, how.to.digits, quantities, all_steps, how.steps)
     for reason in found.left_out:
         typer.echo(f"note: left out: {reason}", err=True)
     for prediction in found.predictions:
@@ -235,12 +207,4 @@ def _estimators(
     else:
         for name, warning in warnings.items():
             typer.echo(f"warning: {name}: {warning}", err=True)
-    if how.plot is not None:
-        estimators.plot_estimators(view, how.plot)
-    write_report(
-        how.format,
-        how.output,
-        partial(estimators.estimator_table, view),
-        partial(estimators.estimator_csv, view),
-        partial(estimators.estimator_json, view),
-    )
+    how.to.write(estimators.estimator_report(view))

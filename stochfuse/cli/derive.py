@@ -2,56 +2,65 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
+import sys
 from typing import Annotated
 
 import typer
 
-from stochfuse.cli.options import Architecture, OutputOption
+from stochfuse.cli.options import (
+    NETWORK,
+    OUTPUT,
+    SCENARIO,
+    ArchitectureName,
+    OutputOption,
+    choice,
+    completed,
+    one_of,
+    option,
+)
+from stochfuse.errors import UsageError
+from stochfuse.scenario.registry import GENERAL, LFG, NAIVE, OPTIMAL, SIMPLIFIED
 
-
-class Formulation(StrEnum):
-    """Formulations that can be derived."""
-
-    simplified = "simplified"
-    general = "general"
-    naive = "naive"
-    optimal = "optimal"
-
-
-class FormulaFormat(StrEnum):
-    """How formulas are written."""
-
-    text = "text"
-    latex = "latex"
-    json = "json"
-
-
-class Correlation(StrEnum):
-    """Initial estimates."""
-
-    independent = "independent"
-    shared = "shared"
-
-
-_Number = typer.Option(metavar="X", help="A number, exact as typed; left out, a symbol.")
+FORMULATIONS = (SIMPLIFIED, GENERAL, NAIVE, OPTIMAL)
+TEXT, LATEX, JSON = FORMATS = ("text", "latex", "json")
+CORRELATIONS = ("independent", "shared")
+EXAMPLES = (
+    "stochfuse derive simplified --agents 3 --step 2",
+    "stochfuse derive general --agents 2 --step 2 --q 25 --r 100 --p0 100 --latex",
+)
+Number = Annotated[str | None, option("A number, exact as typed; left out, a symbol.", SCENARIO, metavar="X")]
 
 
 def derive(
-    formulation: Annotated[Formulation, typer.Argument(help="Which formulation.")] = Formulation.simplified,
-    agents: Annotated[int, typer.Option(min=1, help="Number of like agents.")] = 3,
-    step: Annotated[int, typer.Option(min=1, help="The step whose covariance is derived.")] = 2,
-    q: Annotated[str | None, _Number] = None,
-    r: Annotated[str | None, _Number] = None,
-    p0: Annotated[str | None, _Number] = None,
-    architecture: Annotated[
-        Architecture, typer.Option(help="general, naive, optimal: who may hear whom.")
-    ] = Architecture.ad_hoc,
-    correlation: Annotated[Correlation, typer.Option(help="Initial estimates.")] = Correlation.independent,
-    latex: Annotated[bool, typer.Option("--latex", help="The same as --format latex.")] = False,
+    formulation: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME",
+            help=f"{', '.join(FORMULATIONS)}; default: simplified.",
+            callback=one_of(FORMULATIONS),
+            autocompletion=completed(FORMULATIONS),
+            show_default=False,
+        ),
+    ] = SIMPLIFIED,
+    agents: Annotated[int, option("Number of like agents; default: 3.", NETWORK, min=1, metavar="N")] = 3,
+    step: Annotated[int, option("The step whose covariance is derived; default: 2.", NETWORK, min=1, metavar="K")] = 2,
+    architecture: ArchitectureName = "ad-hoc",
+    q: Number = None,
+    r: Number = None,
+    p0: Number = None,
+    correlation: Annotated[
+        str, choice(CORRELATIONS, f"Initial estimates: {' or '.join(CORRELATIONS)}; default: independent.", SCENARIO)
+    ] = "independent",
+    latex: Annotated[bool, option("The same as --format latex.", OUTPUT, "--latex")] = False,
     format: Annotated[
-        FormulaFormat | None,
-        typer.Option("--format", "-f", help="text (default): two-dimensional in a terminal, one line each when piped."),
+        str | None,
+        choice(
+            FORMATS,
+            "text (two-dimensional in a terminal, one line each when piped), latex, json.",
+            OUTPUT,
+            "--format",
+            "-f",
+        ),
     ] = None,
     output: OutputOption = None,
 ) -> None:
@@ -62,37 +71,32 @@ def derive(
     and coefficients by number of arrivals; naive: the same for naive fusion; optimal: for the best that linear fusion
     can do. Forms too large to expand stay small with numbers for q, r and p0.
     """
-    import sys
-
-    from stochfuse.errors import UsageError
     from stochfuse.report.table import check_writable, terminal_width, to_json, write_text
 
-    if latex and format not in (None, FormulaFormat.latex):
+    if latex and format not in (None, LATEX):
         raise UsageError("--latex and --format: expected one of them, got both")
     check_writable(output)
     from stochfuse.report import derivation
     from stochfuse.symbolic.simplified import SimplifiedForm, derive_simplified
 
-    if formulation is Formulation.simplified:
-        if architecture is Architecture.cyclic:
+    if formulation == SIMPLIFIED:
+        if architecture == "cyclic":
             raise UsageError("--architecture cyclic: expected formulation general, got simplified")
-        form = derive_simplified(agents, step, q, r, p0, correlation=correlation.value)
-    elif formulation is Formulation.optimal:
+        form = derive_simplified(agents, step, q, r, p0, correlation=correlation)
+    elif formulation == OPTIMAL:
         from stochfuse.symbolic.optimal import derive_optimal
 
-        form = derive_optimal(agents, step, q, r, p0, architecture=architecture.value, correlation=correlation.value)
+        form = derive_optimal(agents, step, q, r, p0, architecture=architecture, correlation=correlation)
     else:
         from stochfuse.symbolic.general import derive_general
 
-        estimator = "naive" if formulation is Formulation.naive else "local-fusion-graph"
-        start = correlation.value
-        form = derive_general(
-            agents, step, q, r, p0, architecture=architecture.value, correlation=start, estimator=estimator
-        )
+        estimator = NAIVE if formulation == NAIVE else LFG
+        start = correlation
+        form = derive_general(agents, step, q, r, p0, architecture=architecture, correlation=start, estimator=estimator)
     made = derivation.derivation(form)
-    if latex or format is FormulaFormat.latex:
+    if latex or format == LATEX:
         text = derivation.to_latex(made)
-    elif format is FormulaFormat.json:
+    elif format == JSON:
         text = to_json(derivation.to_mapping(made))
     elif output is None and sys.stdout.isatty():
         text = derivation.to_pretty(made, terminal_width())

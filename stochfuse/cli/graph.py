@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
+from functools import partial
 from typing import Annotated
 
 import typer
 
-from stochfuse.cli.options import OutputOption, PlotOption, check_files
+from stochfuse.cli.options import OUTPUT, SHOWN, OutputOption, PlotOption, check_files, choice, option
+from stochfuse.errors import UsageError
 
-
-class GraphFormat(StrEnum):
-    """How a graph is written."""
-
-    text = "text"
-    dot = "dot"
-    json = "json"
+TEXT, DOT, JSON = FORMATS = ("text", "dot", "json")
+EXAMPLES = (
+    "stochfuse graph --agent 1 --step 3",
+    "stochfuse graph --scenario thesis-steady --agent 1 --step 3 --plot graph.svg",
+)
 
 
 def graph(
@@ -26,15 +25,15 @@ def graph(
             help="TOML or JSON file that says which message arrived when, - for standard input, or thesis-example.",
         ),
     ] = "thesis-example",
-    agent: Annotated[int | None, typer.Option(min=1, help="Whose fusions; default: everyone's.")] = None,
-    step: Annotated[int | None, typer.Option(min=1, help="At which step; default: every step.")] = None,
-    shared: Annotated[bool, typer.Option("--shared", help="All agents start from one common estimate.")] = False,
+    agent: Annotated[int | None, option("Whose fusions; default: everyone's.", SHOWN, min=1, metavar="N")] = None,
+    step: Annotated[int | None, option("At which step; default: every step.", SHOWN, min=1, metavar="K")] = None,
+    shared: Annotated[bool, option("All agents start from one common estimate.", SHOWN, "--shared")] = False,
     scenario: Annotated[
-        str | None, typer.Option(help="Add the claimed covariances with this scenario's model and sensors.")
+        str | None, option("Add the claimed covariances with this scenario's model and sensors.", SHOWN, metavar="FILE")
     ] = None,
     format: Annotated[
-        GraphFormat, typer.Option("--format", "-f", help="text: in words; dot: for Graphviz; json: for programs.")
-    ] = GraphFormat.text,
+        str, choice(FORMATS, "text (in words), dot (for Graphviz), json; default: text.", OUTPUT, "--format", "-f")
+    ] = TEXT,
     output: OutputOption = None,
     plot: PlotOption = None,
 ) -> None:
@@ -42,10 +41,10 @@ def graph(
 
     Without a history: the worked example of the thesis' section 2.4.
     """
-    from stochfuse.errors import UsageError
     from stochfuse.estimators.fusion_graph import FusionGraph, load_history
     from stochfuse.kalman.metrics import metric as metric_of
     from stochfuse.report import fusion_graph as report
+    from stochfuse.report.plot import save
     from stochfuse.report.table import terminal_width, to_json, write_text
 
     check_files(output, plot, history, scenario or "")
@@ -53,7 +52,7 @@ def graph(
     agents = range(1, made.history.agents + 1) if agent is None else [agent]
     steps = range(1, made.history.steps + 1) if step is None else [step]
     explanations = [made.explain(i, k) for k in steps for i in agents]
-    if (plot is not None or format is GraphFormat.dot) and (agent is None or step is None):
+    if (plot is not None or format == DOT) and (agent is None or step is None):
         raise UsageError("a drawing shows one agent at one step: expected --agent and --step")
     values = None
     if scenario is not None:
@@ -65,10 +64,10 @@ def graph(
         claimed = {node: float(metric.of(estimate.P)) for node, estimate in made.estimates(given).items()}
         values = report.ClaimedAtNodes(metric, claimed)
     if plot is not None:
-        report.plot(made, explanations[0], plot)
-    if format is GraphFormat.json:
+        save(partial(report.draw, made, explanations[0]), plot)
+    if format == JSON:
         text = to_json(report.to_mapping(made, explanations, values))
-    elif format is GraphFormat.dot:
+    elif format == DOT:
         text = report.to_dot(made, explanations[0])
     else:
         text = report.to_text(explanations, values, terminal_width())

@@ -2,168 +2,127 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
-from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
 from stochfuse.cli.options import (
-    AgentsOption,
-    ArchitectureOption,
-    DigitsOption,
-    FormatOption,
-    LinkOption,
-    MaxGraphsOption,
+    RARE,
+    SHOWN,
+    WORK,
+    Changes,
+    Graphs,
     MetricOption,
-    OutputOption,
-    P0Option,
-    PlotOption,
-    PruneOption,
-    QOption,
-    ROption,
-    RunsOption,
+    Sampling,
     ScenarioArgument,
-    SeedOption,
-    StepsOption,
-    check_files,
+    Written,
     check_memory,
-    chosen_format,
-    load,
+    choice,
+    option,
     settings_for,
-    write_report,
 )
+from stochfuse.errors import UsageError
+from stochfuse.scenario.registry import GENERAL, LFG, MONTE_CARLO, NAIVE
 
 if TYPE_CHECKING:
     from stochfuse.questions.messages import MessageLoad
 
-
-class Rule(StrEnum):
-    """Which messages."""
-
-    local_fusion_graph = "local-fusion-graph"
-    naive = "naive"
-    both = "both"
+BOTH, EXACT = "both", "exact"
+EXAMPLES = (
+    "stochfuse messages --steps 12 --from-step 6 --architecture broadcast",
+    "stochfuse messages --accuracy --steps 3 --bytes",
+)
 
 
-class Method(StrEnum):
-    """How loads are computed."""
+class Shown(NamedTuple):
+    """What of the load is shown."""
 
-    exact = "exact"
-    monte_carlo = "monte-carlo"
+    distribution: Annotated[
+        bool, option("Probabilities of every number of nodes instead.", SHOWN, "--distribution")
+    ] = False
+    cdf: Annotated[bool, option("Probabilities of at most so many nodes instead.", SHOWN, "--cdf")] = False
+    accuracy: Annotated[
+        bool, option("Accuracy of the fused estimate beside the mean load instead.", SHOWN, "--accuracy")
+    ] = False
+    metric: MetricOption = None
+    quantity: Annotated[
+        str | None,
+        option("--accuracy: claimed, actual, consistency, bias or rms; default: actual.", SHOWN, metavar="NAME"),
+    ] = None
+    bytes: Annotated[bool, option("Bytes too, from the scenario's state dimension.", SHOWN, "--bytes")] = False
+    header: Annotated[
+        int | None,
+        option("Bytes of every message beside its nodes; sets --bytes.", SHOWN + RARE, min=0, metavar="BYTES"),
+    ] = None
 
 
 def messages(
     scenario: ScenarioArgument = "thesis-transient",
-    agents: AgentsOption = None,
-    steps: StepsOption = None,
-    link: LinkOption = None,
-    q: QOption = None,
-    r: ROption = None,
-    p0: P0Option = None,
-    architecture: ArchitectureOption = None,
-    rule: Annotated[Rule, typer.Option(help="Whose messages.")] = Rule.both,
+    changes: Changes = Changes(),
+    rule: Annotated[
+        str, choice((LFG, NAIVE, BOTH), f"Whose messages: {LFG}, {NAIVE} or both; default: both.", SHOWN)
+    ] = BOTH,
     from_step: Annotated[
-        int | None, typer.Option(min=1, metavar="K", help="First step counted; default: 1. The last one is --steps.")
+        int | None, option("First step counted; default: 1. The last one is --steps.", SHOWN, min=1, metavar="K")
     ] = None,
-    step: Annotated[int | None, typer.Option(min=1, metavar="K", help="Count this step alone.")] = None,
+    step: Annotated[int | None, option("Count this step alone.", SHOWN, min=1, metavar="K")] = None,
     agent: Annotated[
-        str, typer.Option(metavar="N", help="Whose load where agents differ: mean (any of them) or an agent's number.")
+        str, option("Whose load, where agents differ: mean or an agent's number; default: mean.", SHOWN, metavar="N")
     ] = "mean",
-    distribution: Annotated[
-        bool, typer.Option("--distribution", help="Probabilities of every number of nodes instead.")
-    ] = False,
-    cdf: Annotated[bool, typer.Option("--cdf", help="Probabilities of at most so many nodes instead.")] = False,
-    accuracy: Annotated[
-        bool, typer.Option("--accuracy", help="Accuracy of the fused estimate beside the mean load instead.")
-    ] = False,
-    metric: MetricOption = None,
-    quantity: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="--accuracy: claimed, actual, consistency, bias or rms; default: actual."),
-    ] = None,
-    bytes: Annotated[bool, typer.Option("--bytes", help="Bytes too, from the scenario's state dimension.")] = False,
-    header: Annotated[
-        int | None, typer.Option(min=0, metavar="BYTES", help="Bytes of every message beside its nodes; sets --bytes.")
-    ] = None,
+    shown: Shown = Shown(),
     method: Annotated[
-        Method,
-        typer.Option(help="exact; or monte-carlo, for networks too large for it (naive loads are always exact)."),
-    ] = Method.exact,
-    max_graphs: MaxGraphsOption = None,
-    prune: PruneOption = False,
-    runs: RunsOption = None,
-    seed: SeedOption = None,
-    digits: DigitsOption = 5,
-    format: FormatOption = None,
-    output: OutputOption = None,
-    plot: PlotOption = None,
+        str,
+        choice((EXACT, MONTE_CARLO), "exact; or monte-carlo, for networks too large for it; default: exact.", WORK),
+    ] = EXACT,
+    graphs: Graphs = Graphs(),
+    sampling: Sampling = Sampling(),
+    to: Written = Written(),
 ) -> None:
     """Tabulate message load: how many nodes new to an agent the messages of a step bring it.
 
-    A lower bound for any protocol: senders that know what the receiver lacks.
-    Example: stochfuse messages --steps 12 --from-step 6 --architecture broadcast
+    A lower bound for any protocol: senders that know what the receiver lacks. Naive loads are always exact.
     """
-    from stochfuse.errors import UsageError
     from stochfuse.kalman.metrics import metric as metric_of
     from stochfuse.questions.messages import RULES, message_load
     from stochfuse.questions.messages import accuracy as accuracy_of
     from stochfuse.report import messages as reports
 
-    check_files(output, plot, scenario)
-    kind = _kind(distribution=distribution, cdf=cdf, accuracy=accuracy)
-    if kind in ("distribution", "cdf") and (bytes or header is not None):
+    to.check(scenario)
+    kind = _kind(distribution=shown.distribution, cdf=shown.cdf, accuracy=shown.accuracy)
+    if kind in ("distribution", "cdf") and (shown.bytes or shown.header is not None):
         raise UsageError(f"--{kind}: expected neither --bytes nor --header, every node has the same size")
-    for_accuracy = {"--metric": metric, "--quantity": quantity, "--max-graphs": max_graphs, "--prune": prune or None}
-    for option, value in for_accuracy.items():
-        if value is not None and not accuracy:
-            raise UsageError(f"{option}: expected --accuracy, which it is for")
-    sampling = settings_for([method.value], runs=runs, seed=seed)
-    averaging = ["general", "naive"] if method is Method.exact else [method.value]
-    graphs = settings_for(averaging, max_graphs=max_graphs, prune=prune)
-    given, links = load(scenario, agents, steps, architecture, q, r, p0, link)
-    check_memory(given, links, chosen_format(format, output))
+    for_accuracy = {
+        "--metric": shown.metric,
+        "--quantity": shown.quantity,
+        "--max-graphs": graphs.max_graphs,
+        "--prune": graphs.prune or None,
+    }
+    for flag, value in for_accuracy.items():
+        if value is not None and not shown.accuracy:
+            raise UsageError(f"{flag}: expected --accuracy, which it is for")
+    drawn = settings_for([method], **sampling._asdict())
+    averaged = settings_for([GENERAL, NAIVE] if method == EXACT else [method], **graphs._asdict())
+    given, links = changes.of(scenario)
+    check_memory(given, links, to.kind)
     first, last = _window(given.network.steps, from_step, step)
     whose = int(agent) if agent.isdigit() else agent
-    wanted = [each for each in RULES if rule.value in (each, "both")]
+    wanted = [each for each in RULES if rule in (each, BOTH)]
     of_rule = {
-        each: message_load(given, links, each, method=method.value, **sampling).between(first, last)
-        for each in {*wanted, "naive"}  # naive loads are the numbers of messages
+        each: message_load(given, links, each, method=method, **drawn).between(first, last)
+        for each in {*wanted, NAIVE}  # naive loads are the numbers of messages
     }
     loads = tuple(of_rule[each] for each in wanted)
     loads[0].mean(whose)  # a request that cannot be met should say so before longer work
-    chosen = metric_of(metric or given.metric or "trace", given.model)
-    accuracies = tuple(
-        accuracy_of(
-            each,
-            links,
-            metric=chosen,
-            quantity=quantity or "actual",
-            agent=whose,
-            method=method.value,
-            **sampling,
-            **graphs,
-        )
-        for each in loads
-        if accuracy
-    )
-    in_bytes = (header or 0) if bytes or header is not None else None
-    view = reports.LoadView(loads, of_rule["naive"], kind, whose, in_bytes, accuracies, chosen, digits)
+    chosen = metric_of(shown.metric or given.metric or "trace", given.model)
+    asked = {"metric": chosen, "quantity": shown.quantity or "actual", "agent": whose, "method": method}
+    accuracies = tuple(accuracy_of(each, links, **asked, **drawn, **averaged) for each in loads if shown.accuracy)
+    in_bytes = (shown.header or 0) if shown.bytes or shown.header is not None else None
+    view = reports.LoadView(loads, of_rule[NAIVE], kind, whose, in_bytes, accuracies, chosen, to.digits)
     _note(loads, accuracies)
-    if plot is not None:
-        reports.plot_load(view, plot)
-    write_report(
-        format,
-        output,
-        partial(reports.load_table, view),
-        partial(reports.load_csv, view),
-        partial(reports.load_json, view),
-    )
+    to.write(reports.load_report(view))
 
 
 def _kind(**wanted: bool) -> str:
-    from stochfuse.errors import UsageError
-
     chosen = [name for name, value in wanted.items() if value]
     if len(chosen) > 1:
         raise UsageError(f"--{chosen[1]}: expected without --{chosen[0]}, one of them at a time")
@@ -171,13 +130,11 @@ def _kind(**wanted: bool) -> str:
 
 
 def _window(steps: int, from_step: int | None, step: int | None) -> tuple[int, int]:
-    from stochfuse.errors import UsageError
-
     if step is not None and from_step is not None:
         raise UsageError("--step: expected without --from-step, one of them at a time")
-    for option, value in (("--step", step), ("--from-step", from_step)):
+    for flag, value in (("--step", step), ("--from-step", from_step)):
         if value is not None and value > steps:
-            raise UsageError(f"{option}: expected a step from 1 to {steps} (see --steps), got {value}")
+            raise UsageError(f"{flag}: expected a step from 1 to {steps} (see --steps), got {value}")
     return (step, step) if step is not None else (from_step or 1, steps)
 
 

@@ -1,171 +1,274 @@
-"""Options that several commands share, and how their texts become values."""
+"""Options that several commands share, each declared once, and how their texts become values.
+
+A command names groups of options (`Changes`, `Settings`, `Written`, …) as its parameters; `gathered` lays them out as
+single options for Typer and hands them on together.  `stochfuse.cli.help` shows them by panel; those marked rare only
+under --help-all.
+"""
 
 from __future__ import annotations
 
+import inspect
 import os
 from collections.abc import Callable, Sequence
-from enum import StrEnum
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_type_hints
 
 import typer
 
 from stochfuse.cli.progress import quiet
+from stochfuse.errors import UsageError, nearest
+from stochfuse.scenario import registry
+from stochfuse.scenario.registry import CRITERIA, ESTIMATORS, GENERAL, METHODS, MONTE_CARLO, NAIVE, QUANTITIES
 
 if TYPE_CHECKING:
-    from stochfuse.report.table import Table
+    from stochfuse.report.table import Report
     from stochfuse.scenario.scenario import Scenario
 
 MOST_LINKS = 1_000_000
+SCENARIO, NETWORK, SHOWN, WORK, OUTPUT = "Scenario", "Network", "What is shown", "How it is worked out", "Output"
+RARE = ", rarely used"
+"""Ends a panel whose options `--help` leaves to `--help-all`."""
+FORMATS = ("table", "csv", "json", "markdown", "latex")
+ARCHITECTURES = ("ad-hoc", "broadcast", "cyclic")
 
 
-class Format(StrEnum):
-    """Output formats."""
+def one_of(names: Sequence[str]) -> Callable[[str | None], str | None]:
+    """Return what refuses a value that is none of the names, and says which is nearest."""
 
-    table = "table"
-    csv = "csv"
-    json = "json"
-    markdown = "markdown"
-    latex = "latex"
+    def check(value: str | None) -> str | None:
+        if value is not None and value not in names:
+            raise typer.BadParameter(f"expected one of {', '.join(names)}, got '{value}'{nearest(value, names)}")
+        return value
 
-
-class Estimator(StrEnum):
-    """What the agents do with what arrives."""
-
-    local_fusion_graph = "local-fusion-graph"
-    naive = "naive"
-    optimal = "optimal"
-    covariance_intersection = "covariance-intersection"
-    split_ci = "split-ci"
-    blender = "blender"
-    joint_blender = "joint-blender"
-    equivalent_measurement = "equivalent-measurement"
-    independent_measurements = "independent-measurements"
-    lwin = "lwin"
-    itns = "itns"
-    stand_alone = "stand-alone"
+    return check
 
 
-class Criterion(StrEnum):
-    """What the weights of an intersection minimise."""
+def completed(names: Sequence[str] | Callable[[], Sequence[str]]) -> Callable[[str], list[str]]:
+    """Return what the shell is told: the names that begin so, after the last comma."""
 
-    det = "det"
-    trace = "trace"
-    max_eig = "max-eig"
+    def complete(incomplete: str) -> list[str]:
+        before, comma, last = incomplete.rpartition(",")
+        return [before + comma + name for name in (names() if callable(names) else names) if name.startswith(last)]
 
-
-class Architecture(StrEnum):
-    """Network architectures."""
-
-    ad_hoc = "ad-hoc"
-    broadcast = "broadcast"
-    cyclic = "cyclic"
+    return complete
 
 
-def complete_scenario(incomplete: str) -> list[str]:
-    """Return the presets that begin so, for the shell."""
+def choice(names: Sequence[str], help: str, panel: str, *flags: str, **more: Any) -> Any:
+    """An option that takes one of some names."""
+    return typer.Option(
+        *flags, help=help, rich_help_panel=panel, metavar="NAME", callback=one_of(names),
+        autocompletion=completed(names), show_default=False, **more,
+    )  # fmt: skip
+
+
+def option(help: str, panel: str, *flags: str, **more: Any) -> Any:
+    """An option in a panel."""
+    return typer.Option(*flags, help=help, rich_help_panel=panel, **{"show_default": False, **more})
+
+
+def presets() -> Sequence[str]:
+    """Names of the presets."""
     from stochfuse.scenario.scenario import preset_names
 
-    return [name for name in preset_names() if name.startswith(incomplete)]
+    return preset_names()
 
 
 ScenarioArgument = Annotated[
     str,
     typer.Argument(
         metavar="SCENARIO",
-        help="TOML or JSON file, - for standard input, or a preset's name (see `stochfuse scenario list`).",
-        autocompletion=complete_scenario,
+        help="TOML or JSON file, - for standard input, or a preset (stochfuse scenario list).",
+        autocompletion=completed(presets),
     ),
 ]
 OutputOption = Annotated[
-    Path | None, typer.Option("--output", "-o", metavar="FILE", help="Write there instead of to standard output.")
+    Path | None, option("Write there, not to standard output.", OUTPUT, "--output", "-o", metavar="FILE")
 ]
 FormatOption = Annotated[
-    Format | None,
-    typer.Option("--format", "-f", help="Output format; default: table, or what the output file's name says."),
-]
-
-
-AgentsOption = Annotated[int | None, typer.Option(min=1, help="Number of agents.")]
-StepsOption = Annotated[int | None, typer.Option(min=1, help="Number of time steps.")]
-LinkOption = Annotated[
     str | None,
-    typer.Option(metavar="SPEC", help="Link probabilities, for all links alike: 0.5, 0.2,0.5 or 0:1:0.25 (both ends)."),
+    choice(FORMATS, f"{', '.join(FORMATS)}; default: table, or by the name of --output.", OUTPUT, "--format", "-f"),
 ]
-QOption = Annotated[float | None, typer.Option(help="Process noise variance Q (times the identity).")]
-ROption = Annotated[
-    float | None, typer.Option(help="Measurement noise variance R (times the identity), of agents without their own.")
-]
-P0Option = Annotated[float | None, typer.Option(help="Variance of the initial estimates P(k0) (times the identity).")]
-ArchitectureOption = Annotated[Architecture | None, typer.Option(help="Who may hear whom.")]
-MetricOption = Annotated[
-    str | None,
-    typer.Option(
-        help="trace, det, max-eig, var:STATE, std:STATE or rms:STATE,STATE; default: the scenario's, else trace."
-    ),
-]
-AgentOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="N",
-        help="Whose covariance where agents differ: mean, worst, best or an agent's number; default: the scenario's, "
-        "else mean.",
-    ),
-]
-EstimatorOption = Annotated[
-    Estimator | None,
-    typer.Option(
-        help="general, monte-carlo: what the agents do with what arrives; default: local-fusion-graph.",
-        show_default=False,
-    ),
-]
-MaxGraphsOption = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        help="general, naive: different graphs that may be carried from step to step; default: 100000.",
-        show_default=False,
-    ),
-]
-PruneOption = Annotated[
-    bool,
-    typer.Option(
-        "--prune", help="general, naive: beyond --max-graphs leave the least likely out, and say how likely they were."
-    ),
-]
-RunsOption = Annotated[
-    int | None,
-    typer.Option(
-        min=2,
-        help="monte-carlo: independent runs per link probability; default: the scenario's, else 1000.",
-        show_default=False,
-    ),
-]
-SeedOption = Annotated[
-    int | None,
-    typer.Option(min=0, help="monte-carlo: seed of the random numbers; default: 1.", show_default=False),
+PlotOption = Annotated[Path | None, option("Also draw a figure: .png, .svg or .pdf.", OUTPUT, metavar="FILE")]
+DigitsOption = Annotated[
+    int, option("Significant digits in tables; default: 5.", OUTPUT + RARE, min=1, max=17, metavar="N")
 ]
 WorkersOption = Annotated[
-    int | None,
-    typer.Option(min=1, help="monte-carlo: processes; default: one for small samples, else one per processor."),
+    int | None, option("monte-carlo: processes; default: by the size of the sample.", WORK + RARE, min=1, metavar="N")
+]
+ArchitectureName = Annotated[str, choice(ARCHITECTURES, f"Who may hear whom: {', '.join(ARCHITECTURES)}.", NETWORK)]
+EstimatorOption = Annotated[
+    str | None,
+    choice(ESTIMATORS, "What the agents do with what arrives (stochfuse methods); default: local-fusion-graph.", WORK),
+]
+MetricOption = Annotated[
+    str | None,
+    option(
+        "trace, det, max-eig, var:STATE, std:STATE or rms:STATE,STATE; default: the scenario's, else trace.", SHOWN,
+        metavar="NAME", autocompletion=completed([m.name.partition("STATE")[0] for m in registry.METRIC]),
+    ),
+]  # fmt: skip
+AgentOption = Annotated[
+    str | None, option("Whose, where agents differ: mean, worst, best or a number; default: mean.", SHOWN, metavar="N")
 ]
 QuantityOption = Annotated[
     str,
-    typer.Option(
-        metavar="NAME",
-        help="claimed, actual, optimal, consistency (actual / claimed), bias or rms; several side by side: "
-        "claimed,actual.",
+    option(
+        f"{', '.join(QUANTITIES)}; several side by side: claimed,actual. Default: claimed.", SHOWN, metavar="NAME",
+        autocompletion=completed(QUANTITIES),
+    ),
+]  # fmt: skip
+
+
+MethodOption = Annotated[
+    str | None,
+    choice(
+        METHODS,
+        f"How to average over what arrives: {', '.join(METHODS)}; default: the scenario's, else simplified.",
+        WORK,
     ),
 ]
-DigitsOption = Annotated[int, typer.Option(min=1, max=17, help="Significant digits in tables.")]
-CriterionOption = Annotated[
-    Criterion | None,
-    typer.Option(
-        help="covariance-intersection, split-ci: what the weights minimise in each fusion; default: det.",
-        show_default=False,
-    ),
+AtOption = Annotated[str | None, option("Only these steps: 1,5,10,last; default: all.", SHOWN, metavar="STEPS")]
+
+
+class Changes(NamedTuple):
+    """What options change in a scenario."""
+
+    agents: Annotated[int | None, option("Number of agents.", NETWORK, min=1, metavar="N")] = None
+    steps: Annotated[int | None, option("Number of time steps.", NETWORK, min=1, metavar="K")] = None
+    link: Annotated[
+        str | None,
+        option("Link probabilities of all links: 0.5, 0.2,0.5 or 0:1:0.25 (both ends).", NETWORK, metavar="SPEC"),
+    ] = None
+    architecture: Annotated[
+        str | None, choice(ARCHITECTURES, f"Who may hear whom: {', '.join(ARCHITECTURES)}.", NETWORK)
+    ] = None
+    q: Annotated[float | None, option("Process noise variance Q (times the identity).", SCENARIO, metavar="X")] = None
+    r: Annotated[
+        float | None, option("Measurement noise variance R, of agents without their own.", SCENARIO, metavar="X")
+    ] = None
+    p0: Annotated[float | None, option("Variance of the first estimates P(k0).", SCENARIO, metavar="X")] = None
+
+    def of(self, scenario: str) -> tuple[Scenario, list[float] | None]:
+        """Return the scenario with the options' values in it, and the link probabilities asked for."""
+        from stochfuse.scenario.scenario import load_scenario
+
+        links = None if self.link is None else parse_link(self.link)
+        changed = self._asdict() | {"link": None}
+        changed.pop("link")
+        return load_scenario(scenario, **changed, uniform_link=links is not None), links
+
+
+MaxGraphsOption = Annotated[
+    int | None, option("general: graphs carried from step to step; default: 100000.", WORK + RARE, min=1, metavar="N")
 ]
-PlotOption = Annotated[Path | None, typer.Option(metavar="FILE", help="Also draw a figure: .png, .svg or .pdf.")]
+
+
+class Graphs(NamedTuple):
+    """How many outcomes are carried where they are enumerated."""
+
+    max_graphs: MaxGraphsOption = None
+    prune: Annotated[
+        bool,
+        option("general: beyond --max-graphs leave out the least likely, and say how likely.", WORK + RARE, "--prune"),
+    ] = False
+
+
+class Sampling(NamedTuple):
+    """How outcomes are sampled."""
+
+    runs: Annotated[
+        int | None, option("monte-carlo: runs per link probability; default: 1000.", WORK, min=2, metavar="N")
+    ] = None
+    seed: Annotated[
+        int | None, option("monte-carlo: seed of the random numbers; default: 1.", WORK, min=0, metavar="N")
+    ] = None
+
+
+class Weighing(NamedTuple):
+    """What only some engines and estimators have."""
+
+    workers: WorkersOption = None
+    criterion: Annotated[
+        str | None,
+        choice(
+            CRITERIA, f"intersections: what the weights minimise, {', '.join(CRITERIA)}; default: det.", WORK + RARE
+        ),
+    ] = None
+
+
+class Written(NamedTuple):
+    """Where an answer goes, and how it looks."""
+
+    format: FormatOption = None
+    output: OutputOption = None
+    plot: PlotOption = None
+    digits: DigitsOption = 5
+
+    @property
+    def kind(self) -> str:
+        """The format asked for, else the one that the output's name suggests, else table."""
+        return chosen_format(self.format, self.output)
+
+    def check(self, *inputs: str) -> None:
+        """Raise UsageError early if a file can never be written, if two are one, or if one is an input."""
+        check_files(self.output, self.plot, *inputs)
+
+    def write(self, report: Report) -> None:
+        """Write a report in the format asked for, and draw it where that is asked for."""
+        if self.plot is not None and report.draw is not None:
+            from stochfuse.report.plot import save
+
+            save(report.draw, self.plot)
+        write_report(report, self.kind, self.output)
+
+
+class Unplotted(NamedTuple):
+    """Where an answer goes that has no figure."""
+
+    format: FormatOption = None
+    output: OutputOption = None
+    digits: DigitsOption = 5
+
+    def check(self, *inputs: str) -> None:
+        """Raise UsageError early if a file can never be written, or is an input."""
+        check_files(self.output, None, *inputs)
+
+    def write(self, report: Report) -> None:
+        """Write a report in the format asked for."""
+        write_report(report, chosen_format(self.format, self.output), self.output)
+
+
+def gathered(command: Callable[..., None]) -> Callable[..., None]:
+    """Lay out a command's groups of options as single ones, in the order of its parameters."""
+    hints = get_type_hints(command, include_extras=True)
+    groups: dict[str, Any] = {
+        name: kind for name, kind in hints.items() if isinstance(kind, type) and issubclass(kind, tuple)
+    }
+    parameters = []
+    for parameter in inspect.signature(command).parameters.values():
+        kind = groups.get(parameter.name)
+        if kind is None:
+            parameters.append(parameter.replace(annotation=hints[parameter.name], kind=inspect.Parameter.KEYWORD_ONLY))
+            continue
+        fields = get_type_hints(kind, include_extras=True)
+        parameters += [
+            inspect.Parameter(
+                field, inspect.Parameter.KEYWORD_ONLY, default=kind._field_defaults[field], annotation=fields[field]
+            )
+            for field in kind._fields
+        ]
+
+    @wraps(command)
+    def laid_out(**given: Any) -> None:
+        for name, kind in groups.items():
+            given[name] = kind(*(given.pop(field) for field in kind._fields))
+        command(**given)
+
+    laid_out.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    laid_out.__annotations__ = {}
+    del laid_out.__wrapped__
+    return laid_out
 
 
 def whose(agent: str | None, scenario: Scenario) -> int | str:
@@ -176,8 +279,6 @@ def whose(agent: str | None, scenario: Scenario) -> int | str:
     UsageError
         If there is no such agent.
     """
-    from stochfuse.errors import UsageError
-
     chosen = (scenario.agent or "mean") if agent is None else int(agent) if agent.isdigit() else agent
     most = scenario.network.agents
     if chosen not in ("mean", "worst", "best") and not (isinstance(chosen, int) and 1 <= chosen <= most):
@@ -185,41 +286,15 @@ def whose(agent: str | None, scenario: Scenario) -> int | str:
     return chosen
 
 
-def load(
-    scenario: str,
-    agents: int | None,
-    steps: int | None,
-    architecture: Architecture | None,
-    q: float | None,
-    r: float | None,
-    p0: float | None,
-    link: str | None,
-) -> tuple[Scenario, list[float] | None]:
-    """Return the scenario with the options' values in it, and the link probabilities asked for."""
-    from stochfuse.scenario.scenario import load_scenario
-
-    links = None if link is None else parse_link(link)
-    given = load_scenario(
-        scenario,
-        agents=agents,
-        steps=steps,
-        architecture=architecture.value if architecture else None,
-        q=q,
-        r=r,
-        p0=p0,
-        uniform_link=links is not None,
-    )
-    return given, links
-
-
+SAMPLED, LISTED, BOTH = (MONTE_CARLO,), (GENERAL, NAIVE), (GENERAL, MONTE_CARLO)
 APPLIES_TO = {
-    "estimator": ("general", "monte-carlo"),
-    "max_graphs": ("general", "naive"),
-    "prune": ("general", "naive"),
-    "runs": ("monte-carlo",),
-    "seed": ("monte-carlo",),
-    "workers": ("monte-carlo",),
-    "criterion": ("general", "monte-carlo"),
+    "estimator": BOTH,
+    "max_graphs": LISTED,
+    "prune": LISTED,
+    "runs": SAMPLED,
+    "seed": SAMPLED,
+    "workers": SAMPLED,
+    "criterion": BOTH,
 }
 """Methods that each setting means something to."""
 
@@ -232,14 +307,31 @@ def settings_for(methods: Sequence[str], **settings: Any) -> dict[str, Any]:
     UsageError
         If none of the methods has any use for one of them.
     """
-    from stochfuse.errors import UsageError
-
     given = {name: value for name, value in settings.items() if value is not None and value is not False}
     for name in given:
         if not set(APPLIES_TO[name]) & set(methods):
             option = "--" + name.replace("_", "-")
             raise UsageError(f"{option}: expected method {' or '.join(APPLIES_TO[name])}, got {', '.join(methods)}")
-    return {name: value.value if isinstance(value, StrEnum) else value for name, value in given.items()}
+    return given
+
+
+def steps_at(text: str | None, scenario: Scenario) -> tuple[int, ...] | None:
+    """Return the steps of `1,5,10,last`, in order; None for all.
+
+    Raises
+    ------
+    UsageError
+        If one is no step of the scenario.
+    """
+    if text is None:
+        return None
+    last, found = scenario.network.steps, set()
+    for word in text.split(","):
+        step = last if word.strip() == "last" else int(word) if word.strip().isdigit() else 0
+        if not 1 <= step <= last:
+            raise UsageError(f"--at: expected steps from 1 to {last}, or last, got '{word.strip()}'")
+        found.add(step)
+    return tuple(sorted(found))
 
 
 def quantity_names(text: str) -> list[str]:
@@ -250,13 +342,11 @@ def quantity_names(text: str) -> list[str]:
     UsageError
         If one is unknown or named twice.
     """
-    from stochfuse.errors import UsageError
-    from stochfuse.prediction.quantities import QUANTITIES
-
     names = [name.strip() for name in text.split(",")]
     for name in names:
         if name not in QUANTITIES:
-            raise UsageError(f"--quantity: expected one or several of {', '.join(QUANTITIES)}, got '{name}'")
+            known = ", ".join(QUANTITIES)
+            raise UsageError(f"--quantity: expected one or several of {known}, got '{name}'{nearest(name, QUANTITIES)}")
     if len(set(names)) < len(names):
         raise UsageError(f"--quantity: expected different ones, got {text}")
     return names
@@ -268,7 +358,6 @@ BYTES = {"table": 1000, "markdown": 1000, "latex": 1000, "csv": 200, "json": 200
 
 def check_memory(scenario: Scenario, links: Sequence[float] | None, kind: str) -> None:
     """Raise UsageError, with an estimate, if the answer cannot be held in this machine's memory."""
-    from stochfuse.errors import UsageError
     from stochfuse.scenario.scenario import link_rows
 
     steps, rows = scenario.network.steps, len(link_rows(scenario, links).link)
@@ -284,7 +373,6 @@ def check_memory(scenario: Scenario, links: Sequence[float] | None, kind: str) -
 
 def check_files(output: Path | None, plot: Path | None, *inputs: str) -> None:
     """Raise UsageError early if a file can never be written, if two are one, or if one is an input."""
-    from stochfuse.errors import UsageError
     from stochfuse.report.table import PLOT_SUFFIXES, check_writable
 
     check_writable(output)
@@ -305,8 +393,6 @@ def parse_link(text: str) -> list[float]:
     UsageError
         If the text is none of these or a value is no probability.
     """
-    from stochfuse.errors import UsageError
-
     values: list[float] = []
     for part in text.split(","):
         try:
@@ -326,8 +412,6 @@ def parse_link(text: str) -> list[float]:
 
 
 def _range(text: str, first: float, last: float, step: float) -> list[float]:
-    from stochfuse.errors import UsageError
-
     if not (step > 0 and last >= first and first >= 0 and last <= 1):
         raise UsageError(f"--link: expected first:last:step with 0 ≤ first ≤ last ≤ 1 and step > 0, got '{text}'")
     count = (last - first) / step
@@ -337,31 +421,24 @@ def _range(text: str, first: float, last: float, step: float) -> list[float]:
     return values if values[-1] >= last - 1e-12 else [*values, last]
 
 
-def write_report(
-    format: Format | None,
-    output: Path | None,
-    table: Callable[[], Table],
-    csv: Callable[[], str],
-    json: Callable[[], Any],
-) -> None:
-    """Write a report to standard output or a file, in the format asked for; only that one is made."""
+def write_report(report: Report, kind: str, output: Path | None) -> None:
+    """Write a report to standard output or a file, in one format."""
     from stochfuse.report.table import render, terminal_width, to_json, write_text
 
-    kind = chosen_format(format, output)
-    if kind == Format.csv.value:
-        text = csv()
-    elif kind == Format.json.value:
-        text = to_json(json())
+    if kind == "csv":
+        text = report.csv()
+    elif kind == "json":
+        text = to_json(report.json())
     else:
-        text = render(table(), kind, terminal_width())
+        text = render(report.table(), kind, terminal_width())
     quiet()
     write_text(text, output)
 
 
-def chosen_format(format: Format | None, output: Path | None) -> str:
+def chosen_format(format: str | None, output: Path | None) -> str:
     """Return the format asked for, else the one that the output's name suggests, else table."""
     if format is not None:
-        return format.value
+        return format
     from stochfuse.report.table import SUFFIXES
 
     return SUFFIXES.get(output.suffix.lower(), "table") if output else "table"

@@ -2,193 +2,112 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
-from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stochfuse.cli.options import (
+    RARE,
+    SHOWN,
     AgentOption,
-    AgentsOption,
-    ArchitectureOption,
-    CriterionOption,
-    DigitsOption,
+    AtOption,
+    Changes,
     EstimatorOption,
-    Format,
-    FormatOption,
-    LinkOption,
-    MaxGraphsOption,
+    Graphs,
+    MethodOption,
     MetricOption,
-    OutputOption,
-    P0Option,
-    PlotOption,
-    PruneOption,
-    QOption,
     QuantityOption,
-    ROption,
-    RunsOption,
+    Sampling,
     ScenarioArgument,
-    SeedOption,
-    StepsOption,
-    WorkersOption,
-    check_files,
+    Weighing,
+    Written,
     check_memory,
-    chosen_format,
-    load,
+    option,
     quantity_names,
     settings_for,
+    steps_at,
     whose,
-    write_report,
 )
+from stochfuse.errors import UsageError
+from stochfuse.scenario.registry import GENERAL, NAIVE, SIMPLIFIED
 
 if TYPE_CHECKING:
     from stochfuse.report.predictions import PredictionView
 
-
-class Method(StrEnum):
-    """Methods of prediction."""
-
-    simplified = "simplified"
-    general = "general"
-    optimal = "optimal"
-    chain = "chain"
-    naive = "naive"
-    monte_carlo = "monte-carlo"
+EXAMPLES = (
+    "stochfuse predict --agents 50 --link 0:1:0.25 --steps 4",
+    "stochfuse predict --method general --quantity claimed,actual --link 0.5",
+)
 
 
 def predict(
     scenario: ScenarioArgument = "thesis-transient",
-    agents: AgentsOption = None,
-    steps: StepsOption = None,
-    link: LinkOption = None,
-    q: QOption = None,
-    r: ROption = None,
-    p0: P0Option = None,
-    architecture: ArchitectureOption = None,
-    method: Annotated[
-        Method | None,
-        typer.Option(
-            help="How to average over which messages arrive; default: the scenario's, else simplified.",
-            show_default=False,
-        ),
-    ] = None,
-    estimator: EstimatorOption = None,
+    changes: Changes = Changes(),
     quantity: QuantityOption = "claimed",
     metric: MetricOption = None,
     statistic: Annotated[
         str,
-        typer.Option(
+        option(
+            "Over the outcomes (general): variance, std, quantile:P, at-most:LIMIT, derivative; default: mean.",
+            SHOWN + RARE,
             metavar="NAME",
-            help="mean; or over the outcomes (general, naive): variance, std, quantile:P, at-most:LIMIT, derivative.",
         ),
     ] = "mean",
     agent: AgentOption = None,
-    normalise: Annotated[bool, typer.Option("--normalise", help="Relative to link probability 0.")] = False,
+    at: AtOption = None,
+    normalise: Annotated[bool, option("Relative to link probability 0.", SHOWN + RARE, "--normalise")] = False,
     steady: Annotated[
-        bool, typer.Option("--steady", help="Add the steady state, P = g(P), with a proved bound (simplified).")
+        bool, option("Add the steady state, P = g(P), with a proved bound (simplified).", SHOWN, "--steady")
     ] = False,
-    max_graphs: MaxGraphsOption = None,
-    prune: PruneOption = False,
-    runs: RunsOption = None,
-    seed: SeedOption = None,
-    workers: WorkersOption = None,
-    criterion: CriterionOption = None,
-    digits: DigitsOption = 5,
-    format: FormatOption = None,
-    output: OutputOption = None,
-    plot: PlotOption = None,
+    method: MethodOption = None,
+    estimator: EstimatorOption = None,
+    sampling: Sampling = Sampling(),
+    graphs: Graphs = Graphs(),
+    weighing: Weighing = Weighing(),
+    to: Written = Written(),
 ) -> None:
     """Tabulate the expected fused covariance against link probability.
 
     Without a scenario: the thesis' transient one. Options override the scenario.
     """
-    from stochfuse.errors import UsageError
     from stochfuse.kalman.metrics import metric as metric_of
     from stochfuse.prediction.predict import predict_several as run
     from stochfuse.prediction.quantities import check
-    from stochfuse.report.predictions import PredictionView
+    from stochfuse.report.predictions import PredictionView, report
 
-    check_files(output, plot, scenario)
+    to.check(scenario)
     quantities = quantity_names(quantity)
-    given, links = load(scenario, agents, steps, architecture, q, r, p0, link)
-    check_memory(given, links, chosen_format(format, output))
-    chosen_agent = whose(agent, given)
+    given, links = changes.of(scenario)
+    check_memory(given, links, to.kind)
+    chosen_agent, steps = whose(agent, given), steps_at(at, given)
     chosen = metric_of(metric or given.metric or "trace", given.model)
     for name in quantities:
         check(name, chosen)
     # an estimator without a method picks the exact engine that takes it, else sampling
     free = method is None and given.method is None and estimator is not None
-    way = Method(given.method or ("general" if free else "simplified")) if method is None else method
+    way = (given.method or (GENERAL if free else SIMPLIFIED)) if method is None else method
     if statistic != "mean":
-        if way not in (Method.general, Method.naive):
-            raise UsageError(f"--statistic {statistic}: expected --method general or naive, got {way.value}")
+        if way not in (GENERAL, NAIVE):
+            raise UsageError(f"--statistic {statistic}: expected --method general or naive, got {way}")
         if normalise:
             raise UsageError("--normalise: expected --statistic mean")
         from stochfuse.prediction.general import check_statistic
 
         for name in quantities:
             check_statistic(statistic, name, chosen)
-    settings = {
-        "steady": steady,
-        **settings_for(
-            [way.value],
-            estimator=estimator,
-            max_graphs=max_graphs,
-            prune=prune,
-            runs=runs,
-            seed=seed,
-            workers=workers,
-            criterion=criterion,
-        ),
-    }
-    asked = None if free else way.value
+    given_settings = {"estimator": estimator, **sampling._asdict(), **graphs._asdict(), **weighing._asdict()}
+    settings = {"steady": steady, **settings_for([way], **given_settings)}
+    asked = None if free else way
     found = run(given, links, asked, quantities, **settings)
     at_zero = run(given, [0.0], asked, quantities, **settings) if normalise else [None] * len(found)
     views = tuple(
-        PredictionView(p, chosen, chosen_agent, baseline, digits, statistic)
+        PredictionView(p, chosen, chosen_agent, baseline, to.digits, statistic, steps)
         for p, baseline in zip(found, at_zero, strict=True)
     )
     for view in views:
         view.values()  # a request that cannot be met should say so before notes and figures
     _warn(views)
-    if len(views) == 1:
-        _report(views[0], format, output, plot)
-    else:
-        _report_several(views, format, output, plot)
-
-
-def _report(view: PredictionView, format: Format | None, output: Path | None, plot: Path | None) -> None:
-    from stochfuse.report import predictions
-
-    if plot is not None:
-        from stochfuse.report.predictions import plot_prediction
-
-        plot_prediction(view, plot)
-    write_report(
-        format,
-        output,
-        partial(predictions.predict_table, view),
-        partial(predictions.predict_csv, view),
-        partial(predictions.predict_json, view),
-    )
-
-
-def _report_several(
-    views: tuple[PredictionView, ...], format: Format | None, output: Path | None, plot: Path | None
-) -> None:
-    from stochfuse.report import predictions as side_by_side
-
-    if plot is not None:
-        side_by_side.plot_side(views, plot)
-    write_report(
-        format,
-        output,
-        partial(side_by_side.side_table, views),
-        partial(side_by_side.side_csv, views),
-        partial(side_by_side.side_json, views),
-    )
+    to.write(report(views))
 
 
 def _warn(views: tuple[PredictionView, ...]) -> None:

@@ -2,35 +2,32 @@
 
 from __future__ import annotations
 
-from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stochfuse.cli.options import (
-    DigitsOption,
-    Format,
-    FormatOption,
-    OutputOption,
-    PlotOption,
+    SCENARIO,
     WorkersOption,
-    check_files,
-    chosen_format,
-    write_report,
+    Written,
+    completed,
+    option,
 )
+from stochfuse.errors import UsageError
 
 if TYPE_CHECKING:
     from stochfuse.report.reproductions import Sheet
     from stochfuse.thesis import Bench
 
 
-def complete_item(incomplete: str) -> list[str]:
-    """Return the keys that begin so, for the shell."""
+EXAMPLES = ("stochfuse reproduce figure-32 --plot figure-32.png", "stochfuse reproduce table-3")
+SPECIAL = ("statements", "all", "timing")
+
+
+def _items() -> list[str]:
     from stochfuse.thesis import listing
 
-    keys = [key for key, _ in listing()] + ["statements", "all", "timing"]
-    return [key for key in keys if key.startswith(incomplete)]
+    return [*(key for key, _ in listing()), *SPECIAL]
 
 
 def reproduce(
@@ -39,15 +36,14 @@ def reproduce(
         typer.Argument(
             metavar="KEY",
             help="figure-32 (or 32), table-3, statements, all or timing; without one: the list of all.",
-            autocompletion=complete_item,
+            autocompletion=completed(_items),
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the records of truth and measurements.")] = 1,
-    digits: DigitsOption = 5,
+    seed: Annotated[
+        int, option("Seed of the records of truth and measurements; default: 1.", SCENARIO, min=0, metavar="N")
+    ] = 1,
     workers: WorkersOption = None,
-    format: FormatOption = None,
-    output: OutputOption = None,
-    plot: PlotOption = None,
+    to: Written = Written(),
 ) -> None:
     """Reproduce a figure or table of the thesis and judge what the thesis says about it.
 
@@ -61,104 +57,67 @@ def reproduce(
     timing: 1000 Monte Carlo runs of the Local Fusion Graph took 12,000 s there, the simplified formulation 2 s; here
     the same pair, and the exact general formulation.
     """
-    from stochfuse.errors import UsageError
     from stochfuse.thesis import Bench, find, sheet
 
-    if plot is not None and what in (None, "statements", "all", "timing"):
+    if to.plot is not None and (what is None or what in SPECIAL):
         raise UsageError("--plot: expected the key of a figure, such as figure-32, to draw")
     if what == "all":
-        _everything(Bench(seed=seed), output, format)
+        _everything(Bench(seed=seed), to)
         return
-    check_files(output, plot)
+    to.check()
     if what is None:
-        _list(format, output)
+        _list(to)
     elif what == "timing":
-        _timing(format, output, workers)
+        _timing(to, workers)
+    elif what == "statements":
+        _statements(Bench(seed=seed), to)
     else:
-        if what != "statements":
-            item = find(what)
-            if plot is not None and item.panels is None:
-                raise UsageError(f"--plot: {item.key.replace('-', ' ')} is a table of parameters, with nothing to draw")
-        bench = Bench(seed=seed)
-        if what == "statements":
-            _statements(bench, format, output)
-            return
-        found = sheet(what, bench)
-        if plot is not None:
-            from stochfuse.report.reproductions import plot_sheet
-
-            plot_sheet(found, plot)
-        _write_sheet(found, format, output, digits)
+        item = find(what)
+        if to.plot is not None and item.panels is None:
+            raise UsageError(f"--plot: {item.key.replace('-', ' ')} is a table of parameters, with nothing to draw")
+        _write_sheet(sheet(what, Bench(seed=seed)), to)
 
 
-def _list(format: Format | None, output: Path | None) -> None:
-    from stochfuse.report import reproductions as report
-    from stochfuse.report.table import to_csv
+def _list(to: Written) -> None:
+    from stochfuse.report.reproductions import listing_report
     from stochfuse.thesis import listing
 
-    entries = listing()
-    write_report(
-        format,
-        output,
-        partial(report.listing_table, entries),
-        partial(to_csv, ("key", "title"), entries),
-        partial(report.listing_json, entries),
-    )
+    to.write(listing_report(listing()))
 
 
-def _statements(bench: Bench, format: Format | None, output: Path | None) -> None:
-    from stochfuse.report import reproductions as report
+def _statements(bench: Bench, to: Written) -> None:
+    from stochfuse.report.reproductions import findings_report
     from stochfuse.thesis import page
 
-    findings = page(bench)
     title = ("Statements of the thesis' chapters 3 and 4, in our words, and what our numbers say to them",)
-    write_report(
-        format,
-        output,
-        partial(report.findings_table, findings, title),
-        partial(report.findings_csv, findings),
-        partial(report.findings_json, findings),
-    )
+    to.write(findings_report(page(bench), title))
 
 
-def _timing(format: Format | None, output: Path | None, workers: int | None) -> None:
-    from stochfuse.report import table
+def _timing(to: Written, workers: int | None) -> None:
     from stochfuse.thesis import timing
 
-    measured = timing(workers=workers)
-    headings = ("work", "thesis_s", "here_s")
-    write_report(format, output, measured.table, partial(table.to_csv, headings, measured.rows), measured.to_mapping)
+    to.write(timing(workers=workers).report())
 
 
-def _write_sheet(found: Sheet, format: Format | None, output: Path | None, digits: int) -> None:
-    from stochfuse.report import reproductions as report
-    from stochfuse.report.table import render, terminal_width, to_json, write_text
+def _write_sheet(found: Sheet, to: Written) -> None:
+    from stochfuse.report.reproductions import sheet_report
 
-    kind = chosen_format(format, output)
-    if kind == Format.csv.value:
-        text = report.sheet_csv([found])
-    elif kind == Format.json.value:
-        text = to_json(report.sheet_json(found))
-    else:
-        text = "\n".join(render(table, kind, terminal_width()) for table in report.sheet_tables(found, digits))
-    write_text(text, output)
+    to.write(sheet_report(found, to.digits))
 
 
-def _everything(bench: Bench, output: Path | None, format: Format | None) -> None:
+def _everything(bench: Bench, to: Written) -> None:
     """Write data, statements and plot of every figure and table into a directory."""
-    from stochfuse.errors import UsageError
-    from stochfuse.report.reproductions import plot_sheet
     from stochfuse.report.table import SUFFIXES
     from stochfuse.thesis import listing, sheet
 
-    if output is None or not output.is_dir():
-        got = "nothing" if output is None else f"'{output}'"
+    folder = to.output
+    if folder is None or not folder.is_dir():
+        got = "nothing" if folder is None else f"'{folder}'"
         raise UsageError(f"reproduce all: expected --output with a directory that exists, got {got}")
-    kind = format or Format.json
-    suffix = next(ending for ending, name in SUFFIXES.items() if name == kind.value)
+    kind = to.format or "json"
+    suffix = next(ending for ending, name in SUFFIXES.items() if name == kind)
     for key, _ in listing():
         found = sheet(key, bench)
-        _write_sheet(found, kind, output / f"{key}{suffix}", 5)
-        if found.panels:
-            plot_sheet(found, output / f"{key}.png")
-    _statements(bench, kind, output / f"statements{suffix}")
+        figure = folder / f"{key}.png" if found.panels else None
+        _write_sheet(found, Written(kind, folder / f"{key}{suffix}", figure))
+    _statements(bench, Written(kind, folder / f"statements{suffix}"))

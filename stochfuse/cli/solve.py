@@ -2,139 +2,138 @@
 
 from __future__ import annotations
 
-from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
 from stochfuse.cli.options import (
+    RARE,
+    SHOWN,
+    WORK,
     AgentOption,
-    AgentsOption,
-    ArchitectureOption,
-    DigitsOption,
+    Changes,
     EstimatorOption,
-    FormatOption,
-    LinkOption,
     MaxGraphsOption,
     MetricOption,
-    OutputOption,
-    P0Option,
-    PlotOption,
-    QOption,
-    ROption,
     ScenarioArgument,
-    StepsOption,
-    check_files,
+    Written,
     check_memory,
-    chosen_format,
-    load,
+    choice,
+    option,
     settings_for,
     whose,
-    write_report,
 )
-from stochfuse.cli.predict import Method
+from stochfuse.errors import UsageError
+from stochfuse.scenario.registry import METHODS, SIMPLIFIED
 
 if TYPE_CHECKING:
     from stochfuse.report.solutions import SolutionSheet
     from stochfuse.scenario.scenario import Scenario
 
+QUESTION = "Options"
+EXAMPLES = (
+    "stochfuse solve --target 30 --method general",
+    "stochfuse solve --target 25 --agents-needed --link 0.5",
+)
+
+
+class Asked(NamedTuple):
+    """Which question."""
+
+    target: Annotated[
+        float | None, option("Least link probability at which the value is at most X.", QUESTION, metavar="X")
+    ] = None
+    agents_needed: Annotated[
+        bool, option("With --target and --link: the least number of agents instead.", QUESTION, "--agents-needed")
+    ] = False
+    sensitivity: Annotated[
+        bool, option("What each link is worth, and which to improve first.", QUESTION, "--sensitivity")
+    ] = False
+    gain: Annotated[
+        bool, option("Share of the gain from µ = 0 to µ = 1 that each --link reaches.", QUESTION, "--gain")
+    ] = False
+    steady: Annotated[
+        bool,
+        option("Ask about the steady state (simplified); alone: tabulate it against --link.", QUESTION, "--steady"),
+    ] = False
+
+    @property
+    def kind(self) -> str:
+        """The one question that is asked.
+
+        Raises
+        ------
+        UsageError
+            If there is none, or several.
+        """
+        return _question(
+            self.target,
+            agents_needed=self.agents_needed,
+            sensitivity=self.sensitivity,
+            gain=self.gain,
+            steady=self.steady,
+        )
+
 
 def solve(
     scenario: ScenarioArgument = "thesis-transient",
-    target: Annotated[
-        float | None,
-        typer.Option(metavar="X", help="Least link probability at which the value is at most X, in the metric's unit."),
-    ] = None,
-    agents_needed: Annotated[
-        bool, typer.Option("--agents-needed", help="With --target and --link: the least number of agents instead.")
-    ] = False,
-    sensitivity: Annotated[
-        bool, typer.Option("--sensitivity", help="What each link is worth, and which to improve first.")
-    ] = False,
-    gain: Annotated[
-        bool, typer.Option("--gain", help="Share of the gain from µ = 0 to µ = 1 that each --link reaches.")
-    ] = False,
-    steady: Annotated[
-        bool,
-        typer.Option("--steady", help="Ask about the steady state (simplified); alone: tabulate it against --link."),
-    ] = False,
-    step: Annotated[int | None, typer.Option(metavar="K", help="Step asked about; default: the last.")] = None,
-    link: LinkOption = None,
+    asked_for: Asked = Asked(),
+    step: Annotated[int | None, option("Step asked about; default: the last.", QUESTION, metavar="K")] = None,
     case: Annotated[
-        str | None, typer.Option(metavar="NAME", help="--sensitivity: which of the scenario's cases.")
+        str | None, option("--sensitivity: which of the scenario's cases.", QUESTION + RARE, metavar="NAME")
     ] = None,
     max_agents: Annotated[
         int | None,
-        typer.Option(min=1, help="--agents-needed: where to give up; default: 1000000, for optimal 100."),
+        option(
+            "--agents-needed: where to give up; default: 1000000, for optimal 100.", QUESTION + RARE, min=1, metavar="N"
+        ),
     ] = None,
-    agents: AgentsOption = None,
-    steps: StepsOption = None,
-    q: QOption = None,
-    r: ROption = None,
-    p0: P0Option = None,
-    architecture: ArchitectureOption = None,
-    method: Annotated[
-        Method, typer.Option(help="How to average over which messages arrive (monte-carlo cannot be asked backwards).")
-    ] = Method.simplified,
-    estimator: EstimatorOption = None,
+    changes: Changes = Changes(),
     quantity: Annotated[
-        str, typer.Option(metavar="NAME", help="claimed, actual, optimal, consistency, bias or rms.")
+        str, option("claimed, actual, optimal, consistency, bias or rms; default: claimed.", SHOWN, metavar="NAME")
     ] = "claimed",
     metric: MetricOption = None,
     agent: AgentOption = None,
+    method: Annotated[
+        str, choice(METHODS, f"How to average over what arrives: {', '.join(METHODS[:-1])}; default: simplified.", WORK)
+    ] = SIMPLIFIED,
+    estimator: EstimatorOption = None,
     max_graphs: MaxGraphsOption = None,
-    digits: DigitsOption = 5,
-    format: FormatOption = None,
-    output: OutputOption = None,
-    plot: PlotOption = None,
+    to: Written = Written(),
 ) -> None:
     """Answer a question asked backwards: which link probability, which link, how many agents.
 
     One question a call: --target X (with --agents-needed: the agents), --sensitivity, --gain, or --steady alone.
-    Example: stochfuse solve --target 30 --method general
     """
-    from stochfuse.errors import UsageError
     from stochfuse.report import solutions
 
-    check_files(output, plot, scenario)
-    kind = _question(target, agents_needed=agents_needed, sensitivity=sensitivity, gain=gain, steady=steady)
-    for option, value, wanted in (
-        ("--link", link, ("agents-needed", "sensitivity", "gain", "steady")),
+    to.check(scenario)
+    kind = asked_for.kind
+    for flag, value, wanted in (
+        ("--link", changes.link, ("agents-needed", "sensitivity", "gain", "steady")),
         ("--case", case, ("sensitivity",)),
         ("--max-agents", max_agents, ("agents-needed",)),
-        ("--agents", agents, ("target", "sensitivity", "gain", "steady")),
+        ("--agents", changes.agents, ("target", "sensitivity", "gain", "steady")),
     ):
         if value is not None and kind not in wanted:
-            raise UsageError(f"{option}: expected with --{', --'.join(wanted)}; got it with --{kind}")
+            raise UsageError(f"{flag}: expected with --{', --'.join(wanted)}; got it with --{kind}")
     asked: dict[str, Any] = {
         "step": step,
-        "steady": steady,
-        "method": method.value,
+        "steady": asked_for.steady,
+        "method": method,
         "quantity": quantity,
         "of": metric,
-        **settings_for([method.value], estimator=estimator, max_graphs=max_graphs),
+        **settings_for([method], estimator=estimator, max_graphs=max_graphs),
     }
-    given, links = load(scenario, agents, steps, architecture, q, r, p0, link)
-    check_memory(given, links, chosen_format(format, output))
+    given, links = changes.of(scenario)
+    check_memory(given, links, to.kind)
     asked["agent"] = whose(agent, given)
-    sheet, found = _answer(kind, given, links, target, case, max_agents, digits, asked)
+    sheet, found = _answer(kind, given, links, asked_for.target, case, max_agents, to.digits, asked)
     _note(sheet)
-    if plot is not None:
-        from stochfuse.report.solutions import plot_solution
-
-        plot_solution(sheet, found, plot)
-    write_report(
-        format,
-        output,
-        partial(solutions.solution_table, sheet),
-        partial(solutions.solution_csv, sheet),
-        partial(solutions.solution_json, sheet),
-    )
+    to.write(solutions.solution_report(sheet, found))
 
 
 def _question(target: float | None, *, agents_needed: bool, sensitivity: bool, gain: bool, steady: bool) -> str:
-    from stochfuse.errors import UsageError
-
     questions = {"target": target is not None, "sensitivity": sensitivity, "gain": gain}
     chosen = [name for name, wanted in questions.items() if wanted]
     if len(chosen) > 1:
@@ -184,8 +183,6 @@ def _answer(
 
 
 def _single(links: list[float] | None, kind: str) -> float:
-    from stochfuse.errors import UsageError
-
     if links is None or len(links) != 1:
         got = "none" if links is None else f"{len(links)} of them"
         raise UsageError(f"--link: expected one link probability with --{kind}, got {got}")
@@ -193,7 +190,7 @@ def _single(links: list[float] | None, kind: str) -> float:
 
 
 def _note(sheet: SolutionSheet) -> None:
-    if sheet.kind == "sensitivity" and sheet.question.method == "simplified" and sheet.question.agent != "mean":
+    if sheet.kind == "sensitivity" and sheet.question.method == SIMPLIFIED and sheet.question.agent != "mean":
         typer.echo(
             "note: the simplified formulation lets an agent's prior stand for the others' too, so that only links to "
             "the agent count; see --method general or optimal",

@@ -7,15 +7,23 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from enum import StrEnum
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from stochfuse.cli.options import DigitsOption, Format, write_report
+from stochfuse.cli.options import (
+    FORMATS,
+    OUTPUT,
+    SHOWN,
+    WORK,
+    DigitsOption,
+    Written,
+    choice,
+    option,
+)
 from stochfuse.cli.progress import quiet
+from stochfuse.errors import UsageError
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -28,78 +36,84 @@ PATIENCE = 10
 """Seconds in which a scheduler should answer."""
 
 
-class Kind(StrEnum):
-    """Plots over two keys."""
+KINDS = ("heat", "contour")
+EXAMPLES = (
+    "stochfuse study trade.toml --workers 2",
+    "stochfuse study trade.toml --over network.link,model.R --plot trade.png",
+)
 
-    heat = "heat"
-    contour = "contour"
+
+class Looked(NamedTuple):
+    """What of the result is looked at."""
+
+    pareto: Annotated[
+        bool, option("The points that no other beats in both accuracy and message load.", SHOWN, "--pareto")
+    ] = False
+    column: Annotated[
+        str | None, option("Value column to show: claimed.trace; default: the first.", SHOWN, metavar="NAME")
+    ] = None
+    step: Annotated[int | None, option("Step to show; default: the last.", SHOWN, min=1, metavar="K")] = None
+    over: Annotated[
+        str | None,
+        option("Keys that the plot is drawn over; default: the first two that vary.", SHOWN, metavar="KEY,KEY"),
+    ] = None
+    where: Annotated[
+        list[str] | None,
+        option(
+            "Only points with this value of a key, in the plot or the front; may be repeated.",
+            SHOWN,
+            metavar="KEY=VALUE",
+        ),
+    ] = None
+    kind: Annotated[
+        str | None, choice(KINDS, "What is drawn over two keys: heat or contour; default: heat.", SHOWN)
+    ] = None
 
 
 def study(
     study: Annotated[str, typer.Argument(metavar="STUDY", help="TOML or JSON file, - for standard input.")],
+    workers: Annotated[int, option("Processes; default: 1.", WORK, min=1, metavar="N")] = 1,
+    dask: Annotated[
+        str | None, option("Work on the cluster of this Dask scheduler, tcp://host:8786.", WORK, metavar="ADDRESS")
+    ] = None,
+    restart: Annotated[bool, option("Begin anew, and replace a result that is there.", WORK, "--restart")] = False,
+    looked: Looked = Looked(),
     output: Annotated[
         Path | None,
-        typer.Option(
+        option(
+            "The result, .parquet or .csv; default: beside the study file, .parquet.",
+            OUTPUT,
             "--output",
             "-o",
             metavar="FILE",
-            help="The result, .parquet or .csv; default: beside the study file, .parquet.",
         ),
     ] = None,
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
-    dask: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help="Work on the cluster of this Dask scheduler, tcp://host:8786."),
-    ] = None,
-    restart: Annotated[bool, typer.Option("--restart", help="Begin anew, and replace a result that is there.")] = False,
-    pareto: Annotated[
-        bool, typer.Option("--pareto", help="Show the points that no other beats in both accuracy and message load.")
-    ] = False,
-    column: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Value column to show: claimed.trace; default: the first."),
-    ] = None,
-    step: Annotated[int | None, typer.Option(min=1, help="Step to show; default: the last.")] = None,
     plot: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Draw the front, or the column over two keys: .png, .svg or .pdf."),
+        option("Draw the front, or the column over two keys: .png, .svg or .pdf.", OUTPUT, metavar="FILE"),
     ] = None,
-    over: Annotated[
-        str | None,
-        typer.Option(metavar="KEY[,KEY]", help="Keys that the plot is drawn over; default: the first two that vary."),
-    ] = None,
-    where: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="KEY=VALUE", help="Only points with this value of a key, in the plot or the front; may be repeated."
-        ),
-    ] = None,
-    kind: Annotated[
-        Kind | None, typer.Option(help="What is drawn over two keys; default: heat.", show_default=False)
+    format: Annotated[
+        str | None, choice(FORMATS, "Format of what is shown; default: table.", OUTPUT, "--format", "-f")
     ] = None,
     digits: DigitsOption = 5,
-    format: Annotated[
-        Format | None, typer.Option("--format", "-f", help="Format of what is shown; default: table.")
-    ] = None,
 ) -> None:
     """Predict many points: a grid, a list or a Latin hypercube over scenario keys and methods.
 
     The result has one row per point and step. Killed at any moment, the same command goes on where it stopped; when it
-    is finished, it shows what there is. Example: stochfuse study trade.toml --workers 2 --plot trade.png
+    is finished, it shows what there is.
     """
     # one thread in matrix products, before NumPy is there: these are small, and workers have a processor each
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from stochfuse.cli.options import check_files
-    from stochfuse.errors import UsageError
     from stochfuse.studies.running import study as run
 
     check_files(output, plot, study)
-    for option, value in (("--over", over), ("--kind", kind)):
-        if value is not None and (plot is None or pareto):
-            raise UsageError(f"{option}: expected --plot without --pareto")
-    for option, value in (("--where", where or None), ("--column", column), ("--step", step)):
-        if value is not None and plot is None and not pareto:
-            raise UsageError(f"{option}: expected --plot or --pareto")
+    for flag, value in (("--over", looked.over), ("--kind", looked.kind)):
+        if value is not None and (plot is None or looked.pareto):
+            raise UsageError(f"{flag}: expected --plot without --pareto")
+    for flag, value in (("--where", looked.where or None), ("--column", looked.column), ("--step", looked.step)):
+        if value is not None and plot is None and not looked.pareto:
+            raise UsageError(f"{flag}: expected --plot or --pareto")
     if dask is not None and workers != 1:
         raise UsageError("--workers: expected nothing with --dask, whose cluster has its own")
     quiet()
@@ -112,51 +126,21 @@ def study(
             typer.echo(f"note: finished points are kept: {command} goes on", err=True)
             raise
     _tell(results)
-    if pareto:
-        _pareto(results, column, step, _pairs(where or []), plot, digits, format)
+    from stochfuse.report import study_figures as studies
+
+    to, where = Written(format, None, plot, digits), _pairs(looked.where or [])
+    if looked.pareto:
+        from stochfuse.report.study_slices import fixed_values
+        from stochfuse.studies.pareto import pareto
+
+        front = pareto(results, looked.column, looked.step, fixed_values(results.plan, where))
+        for note in front.notes:
+            typer.echo(f"note: {note}", err=True)
+        to.write(studies.pareto_report(front, results, digits))
         return
-    if plot is not None:
-        from stochfuse.report.study_figures import plot_over
-
-        keys = None if over is None else tuple(key.strip() for key in over.split(","))
-        plot_over(results, keys, column, (kind or Kind.heat).value, _pairs(where or []), step, plot)
-    from stochfuse.report import studies
-
-    write_report(
-        format,
-        None,
-        partial(studies.summary_table, results, digits),
-        partial(studies.summary_csv, results),
-        partial(studies.summary_json, results),
-    )
-
-
-def _pareto(
-    results: Results,
-    column: str | None,
-    step: int | None,
-    where: dict[str, str],
-    plot: Path | None,
-    digits: int,
-    format: Format | None,
-) -> None:
-    from stochfuse.report import studies
-    from stochfuse.report.study_slices import fixed_values
-    from stochfuse.studies.pareto import pareto
-
-    front = pareto(results, column, step, fixed_values(results.plan, where))
-    for note in front.notes:
-        typer.echo(f"note: {note}", err=True)
-    if plot is not None:
-        from stochfuse.report.study_figures import plot_pareto
-
-        plot_pareto(front, results, plot)
-    write_report(
-        format,
-        None,
-        partial(studies.pareto_table, front, results, digits),
-        partial(studies.pareto_csv, front, results),
-        partial(studies.pareto_json, front, results),
+    keys = None if looked.over is None else tuple(key.strip() for key in looked.over.split(","))
+    to.write(
+        studies.summary_report(results, digits, (keys, looked.column, looked.kind or KINDS[0], where, looked.step))
     )
 
 
@@ -174,8 +158,6 @@ def _tell(results: Results) -> None:
 
 
 def _pairs(texts: list[str]) -> dict[str, str]:
-    from stochfuse.errors import UsageError
-
     found = {}
     for text in texts:
         key, equals, value = text.partition("=")
@@ -193,8 +175,6 @@ def _executor(address: str | None, workers: int) -> Iterator[tuple[Executor | No
     if address is None:
         yield None, workers
         return
-    from stochfuse.errors import UsageError
-
     try:
         from distributed import Client
     except ImportError:

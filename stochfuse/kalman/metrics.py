@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from stochfuse.errors import UsageError
+from stochfuse.errors import UsageError, nearest
 
 NAMES = "trace, det, max-eig, var:STATE, std:STATE or rms:STATE,STATE,…"
 
@@ -101,12 +101,15 @@ def metric(name: str, model: Labelled) -> Metric:
             return of(name, f"standard deviation of {names}", unit, lambda P: np.sqrt(P[..., chosen[0], chosen[0]]))
         root = f"RMS of {names} (root of the summed variances)" if len(chosen) > 1 else f"RMS of {names}"
         return of(name, root, unit, lambda P: np.sqrt(_trace(P[..., chosen, :][..., chosen])), mixed)
-    raise UsageError(f"metric: expected {NAMES}, got '{name}'")
+    near = nearest(kind, ("trace", "det", "max-eig", "var", "std", "rms"))
+    raise UsageError(f"metric: expected {NAMES}, got '{name}'{near}")
 
 
 def _index(name: str, state: str, model: Labelled) -> int:
     if state not in model.states:
-        raise UsageError(f"metric '{name}': no state '{state}'; the states are {', '.join(model.states)}")
+        raise UsageError(
+            f"metric '{name}': no state '{state}'{nearest(state, model.states)}; the states are {', '.join(model.states)}"
+        )
     return model.states.index(state)
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from stochfuse.engines.precision import told
-from stochfuse.errors import StochfuseError, TooManyError, UsageError
+from stochfuse.errors import StochfuseError, TooManyError, UsageError, nearest
 from stochfuse.kalman.checks import covariance_fault
 from stochfuse.prediction.method import RUNS, Averaged, Settings, faults_of
 from stochfuse.prediction.quantities import QUANTITIES
@@ -370,4 +370,4 @@ def _prediction(scenario: Scenario, rows: LinkRows, method: str, quantity: str, 
 def choose(name: str, value: str, choices: Sequence[str]) -> None:
     """Raise UsageError if a value is not one of the choices."""
     if value not in choices:
-        raise UsageError(f"{name}: expected one of {', '.join(choices)}, got '{value}'")
+        raise UsageError(f"{name}: expected one of {', '.join(choices)}, got '{value}'{nearest(value, choices)}")

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
@@ -20,7 +19,7 @@ from stochfuse.prediction.compare import Comparison, EstimatorComparison
 from stochfuse.report import predictions
 from stochfuse.report.plot import COLORS, MARKERS, figure_class, spread
 from stochfuse.report.predictions import PredictionView
-from stochfuse.report.table import Table, number, to_csv, write_file
+from stochfuse.report.table import Report, Table, number, to_csv
 
 SCHEMA = "stochfuse.comparison/1"
 
@@ -69,6 +68,11 @@ class ComparisonView:
         )
 
 
+def comparison_report(view: ComparisonView) -> Report:
+    """Return methods side by side in every form."""
+    return Report.of(view, compare_table, compare_csv, compare_json, draw)
+
+
 def compare_table(view: ComparisonView) -> Table:
     """Return rows of link probability and step, columns of methods."""
     p, digits = view.comparison.reference, view.views[0].digits
@@ -77,7 +81,7 @@ def compare_table(view: ComparisonView) -> Table:
     rows = []
     for i, µ in enumerate(p.link):
         name = () if p.cases is None else (p.cases[i],)
-        for k, step in enumerate(p.steps):
+        for k, step in enumerate(view.views[0].steps):
             cells = []
             for m, value in enumerate(values[:, i, k]):
                 difference = f" {_signed(differences[m, i, k], value, digits)}" if m else ""
@@ -109,7 +113,7 @@ def compare_csv(view: ComparisonView) -> str:
         errors = view.errors(m)
         for i, µ in enumerate(p.link):
             case = "" if p.cases is None else p.cases[i]
-            for k, step in enumerate(p.steps):
+            for k, step in enumerate(first.steps):
                 difference = values[m, i, k] - values[0, i, k]
                 rows.append(
                     (
@@ -159,17 +163,11 @@ def compare_json(view: ComparisonView) -> dict[str, Any]:
         "reference": p.method,
         "link": p.link.tolist(),
         **({} if p.cases is None else {"cases": list(p.cases)}),
-        "steps": p.steps.tolist(),
+        "steps": first.steps.tolist(),
         "methods": methods,
         "scenario": p.scenario.to_mapping(),
         "meta": {"description": list(view.titles), "stage": p.stage, "unit": first.unit or None, "agent": first.agent},
     }
-
-
-def plot_comparison(view: ComparisonView, output: Path) -> None:
-    """Draw values and differences against link probability (or step, where there is one row), colour by step."""
-    figure = draw(view)
-    write_file(output, lambda path: figure.savefig(path, dpi=150))
 
 
 def draw(view: ComparisonView):
@@ -184,9 +182,9 @@ def draw(view: ComparisonView):
     if against_link:
         order = np.argsort(p.link)
         x, along = p.link[order], lambda a, c: a[order, c]
-        chosen, names = spread(len(p.steps)), [f"k = {k}" for k in p.steps]
+        chosen, names = spread(len(first.steps)), [f"k = {k}" for k in first.steps]
     else:
-        x, along = p.steps, lambda a, c: a[c]
+        x, along = first.steps, lambda a, c: a[c]
         chosen, names = spread(len(p.link)), list(p.cases or [f"mean µ = {µ:.3g}" for µ in p.link])
     figure = figure_class()(figsize=(11, 5.4), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -248,6 +246,7 @@ class EstimatorView:
     metric, agent, digits : as for `PredictionView`.
     quantities : one column each.
     every_step : whether the table shows every step, or only the last.
+    at : steps shown, in order; default: all.
     """
 
     comparison: EstimatorComparison
@@ -256,12 +255,16 @@ class EstimatorView:
     digits: int = 5
     quantities: Sequence[str] = ("claimed", "actual", "consistency")
     every_step: bool = False
+    at: tuple[int, ...] | None = None
 
     @cached_property
     def views(self) -> list[list[PredictionView]]:
         """A view of every quantity of every estimator."""
         return [
-            [PredictionView(p.shown_as(q), self.metric, self.agent, None, self.digits) for q in self.quantities]
+            [
+                PredictionView(p.shown_as(q), self.metric, self.agent, digits=self.digits, at=self.at)
+                for q in self.quantities
+            ]
             for p in self.comparison.predictions
         ]
 
@@ -279,7 +282,7 @@ class EstimatorView:
     def titles(self) -> tuple[str, ...]:
         """Lines that say what is shown."""
         first = self.views[0]
-        step = "" if self.every_step else f"after step {self.comparison.predictions[0].steps[-1]}, "
+        step = "" if self.every_step or self.at else f"after step {self.comparison.predictions[0].steps[-1]}, "
         sampled = {f"± one standard error, {p.meta['runs']} runs" for p in self._sampled}
         return (
             *(view.what for view in first),
@@ -300,25 +303,30 @@ class EstimatorView:
         return [p for p in self.comparison.predictions if p.sampled is not None]
 
 
+def estimator_report(view: EstimatorView) -> Report:
+    """Return estimators side by side in every form."""
+    return Report.of(view, estimator_table, estimator_csv, estimator_json, draw_estimators)
+
+
 def estimator_table(view: EstimatorView) -> Table:
     """Return rows of link probability, step and estimator, columns of quantities."""
     p = view.comparison.predictions[0]
-    steps = range(len(p.steps)) if view.every_step else [len(p.steps) - 1]
+    steps, stepwise = view.views[0][0].steps, view.every_step or view.at is not None
     rows = []
     for i, µ in enumerate(p.link):
         name = () if p.cases is None else (p.cases[i],)
-        for k in steps:
+        for k in range(len(steps)) if stepwise else [len(steps) - 1]:
             for estimator, values, errors in zip(view.comparison.estimators, view.values, view.errors, strict=True):
                 cells = [
                     number(value[i, k], view.digits)
                     + ("" if error is None or quantity == "consistency" else f" ±{error[i, k]:.2g}")
                     for quantity, value, error in zip(view.quantities, values, errors, strict=True)
                 ]
-                step = (str(p.steps[k]),) if view.every_step else ()
+                step = (str(steps[k]),) if stepwise else ()
                 rows.append((*name, f"{µ:.6g}", *step, estimator, *cells))
     keys = ("µ",) if p.cases is None else ("links", "mean µ")
     columns = tuple("ratio" if q == "consistency" else q for q in view.quantities)
-    return Table(view.titles, (*keys, *(("k",) if view.every_step else ()), "estimator"), columns, tuple(rows))
+    return Table(view.titles, (*keys, *(("k",) if stepwise else ()), "estimator"), columns, tuple(rows))
 
 
 def estimator_csv(view: EstimatorView) -> str:
@@ -355,7 +363,7 @@ def estimator_json(view: EstimatorView) -> dict[str, Any]:
         "metric": view.metric.name,
         "link": p.link.tolist(),
         **({} if p.cases is None else {"cases": list(p.cases)}),
-        "steps": p.steps.tolist(),
+        "steps": view.views[0][0].steps.tolist(),
         "estimators": found,
         "scenario": p.scenario.to_mapping(),
         "meta": {
@@ -366,12 +374,6 @@ def estimator_json(view: EstimatorView) -> dict[str, Any]:
             "left_out": list(view.comparison.left_out),
         },
     }
-
-
-def plot_estimators(view: EstimatorView, output: Path) -> None:
-    """Draw what is claimed and what is true after the last step, against link probability or case, or a row's steps."""
-    figure = draw_estimators(view)
-    write_file(output, lambda path: figure.savefig(path, dpi=150))
 
 
 def draw_estimators(view: EstimatorView):
@@ -387,7 +389,8 @@ def draw_estimators(view: EstimatorView):
     colors = [COLORS[e % len(COLORS)] for e in range(len(view.values))]
     over_rows = len(p.link) > 1
     order = np.argsort(p.link, kind="stable") if p.cases is None else np.arange(len(p.link))
-    x = p.steps if not over_rows else p.link[order] if p.cases is None else order
+    steps = view.views[0][0].steps
+    x = steps if not over_rows else p.link[order] if p.cases is None else order
     for e, (values, color) in enumerate(zip(view.values, colors, strict=True)):
         for c, quantity in enumerate(view.quantities):
             y = values[c][order, -1] if over_rows else values[c][0]
@@ -412,7 +415,7 @@ def draw_estimators(view: EstimatorView):
         if q != "consistency"
     ]
     figure.legend(handles=[*names, *kinds], fontsize="small", loc="outside lower center", ncols=4)
-    where = f"after step {p.steps[-1]}" if over_rows else p.cases[0] if p.cases else f"µ = {p.link[0]:.3g}"
+    where = f"after step {steps[-1]}" if over_rows else p.cases[0] if p.cases else f"µ = {p.link[0]:.3g}"
     title = f"What estimators claim and what is true, {where}; {view.views[0][0].whom}"
     lines = wrap(title, 45 * len(panels) + 15, break_on_hyphens=False)
     figure.suptitle("\n".join(lines), fontsize="medium")

@@ -11,7 +11,7 @@ from stochfuse import __version__
 from stochfuse.questions.crosscheck import Cell, Verdict
 from stochfuse.questions.results import SimulatorResults
 from stochfuse.report.predictions import PredictionView, counted
-from stochfuse.report.table import Table, number, to_csv
+from stochfuse.report.table import Report, Table, number, to_csv
 
 SCHEMA = "stochfuse.crosscheck/1"
 
@@ -58,6 +58,11 @@ def _agents(cell: Cell) -> str:
     if cell.agents == tuple(range(first, last + 1)):
         return str(first) if first == last else f"{first}-{last}"
     return ",".join(map(str, cell.agents))
+
+
+def crosscheck_report(shown: CrosscheckView) -> Report:
+    """Return a verdict in every form."""
+    return Report.of(shown, crosscheck_table, crosscheck_csv, crosscheck_json)
 
 
 def crosscheck_table(shown: CrosscheckView) -> Table:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +13,7 @@ from stochfuse import __version__
 from stochfuse.estimators.fusion_graph import Explanation, FusionGraph, Node, Term
 from stochfuse.kalman.metrics import Metric
 from stochfuse.report.plot import figure_class
-from stochfuse.report.table import number, write_file
+from stochfuse.report.table import number
 
 SCHEMA = "stochfuse.fusion-graph/1"
 REMOVED, OWN, OTHER = "#f4b183", "#9dc3e6", "#ffffff"
@@ -200,9 +199,3 @@ def draw(graph: FusionGraph, explanation: Explanation):
     ]
     figure.legend(handles=key, loc="outside lower center", ncols=3, fontsize="small", frameon=False)
     return figure
-
-
-def plot(graph: FusionGraph, explanation: Explanation, output: Path) -> None:
-    """Write the figure to a file."""
-    figure = draw(graph, explanation)
-    write_file(output, lambda path: figure.savefig(path, dpi=150))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
@@ -15,7 +14,7 @@ from stochfuse.kalman.metrics import Metric
 from stochfuse.questions.messages import IDENTITY_BYTES, NUMBER_BYTES, Accuracy, Bytes, MessageLoad, in_bytes
 from stochfuse.report.plot import MARKERS, figure_class, spread
 from stochfuse.report.predictions import PredictionView
-from stochfuse.report.table import Table, number, to_csv, write_file
+from stochfuse.report.table import Report, Table, number, to_csv
 from stochfuse.scenario.registry import LFG, NAIVE
 
 SCHEMA = "stochfuse.messages/1"
@@ -134,6 +133,11 @@ class LoadView:
         if self.metric is None:
             raise ValueError("a view of accuracies needs a metric")
         return PredictionView(accuracy.prediction, self.metric, self.agent)
+
+
+def load_report(view: LoadView) -> Report:
+    """Return message loads in every form."""
+    return Report.of(view, load_table, load_csv, load_json, draw)
 
 
 def load_table(view: LoadView) -> Table:
@@ -281,12 +285,6 @@ def load_json(view: LoadView) -> dict[str, Any]:
         "scenario": first.scenario.to_mapping(),
         "meta": {"description": list(view.titles), "agent": view.agent, "header_bytes": view.header or 0},
     }
-
-
-def plot_load(view: LoadView, output: Path) -> None:
-    """Draw the mean load with a band of one standard deviation, the distribution, or accuracy against load."""
-    figure = draw(view)
-    write_file(output, lambda path: figure.savefig(path, dpi=150))
 
 
 def draw(view: LoadView):

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 from stochfuse import __version__
-from stochfuse.report.table import Table, to_csv
+from stochfuse.report.table import Report, Table, to_csv
 from stochfuse.scenario import capabilities, registry
 
 SCHEMA = "stochfuse.methods/1"
+
+
+def methods_report(matrix: bool = False) -> Report:
+    """Return what there is, or the capability table, in every form."""
+    return Report(partial(methods_table, matrix=matrix), partial(methods_csv, matrix=matrix), methods_json)
 
 
 def methods_table(*, matrix: bool = False) -> Table:

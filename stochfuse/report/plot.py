@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from stochfuse.errors import StochfuseError
+from stochfuse.report.table import write_file
 
 MOST_CURVES = 8
 MARKERS = "osD^vP*X"
@@ -27,6 +30,21 @@ def figure_class() -> Any:
     except ImportError:
         raise StochfuseError("plots need matplotlib: pip install 'stochfuse[plot]'") from None
     return Figure
+
+
+def save(draw: Callable[[], Any], output: Path) -> None:
+    """Write a figure to a file.
+
+    Raises
+    ------
+    StochfuseError
+        If matplotlib is not installed.
+    UsageError
+        If the file cannot be written.
+    """
+    figure_class()
+    figure = draw()
+    write_file(output, lambda path: figure.savefig(path, dpi=150))
 
 
 def spread(n: int) -> list[int]:

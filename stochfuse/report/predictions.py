@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
@@ -21,7 +20,7 @@ from stochfuse.prediction.quantities import OVERCONFIDENT, expectation, noun, ti
 from stochfuse.prediction.quantities import unit as unit_of
 from stochfuse.prediction.result import Prediction
 from stochfuse.report.plot import MARKERS, figure_class, spread
-from stochfuse.report.table import Table, number, to_csv, to_text, write_file
+from stochfuse.report.table import Report, Table, number, to_csv, to_text
 from stochfuse.scenario.registry import OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.registry import title as method_title
 
@@ -50,6 +49,7 @@ class PredictionView:
     baseline : the same prediction at link probability 0, to normalise by, or None.
     digits : significant digits in tables.
     statistic : "mean", or what of the metric's distribution over the outcomes, see `Prediction.statistic`.
+    at : steps shown, in order; default: all.
     """
 
     prediction: Prediction
@@ -58,6 +58,15 @@ class PredictionView:
     baseline: Prediction | None = None
     digits: int = 5
     statistic: str = "mean"
+    at: tuple[int, ...] | None = None
+
+    @property
+    def steps(self) -> np.ndarray:
+        """Steps shown."""
+        return self.prediction.steps if self.at is None else np.array(self.at)
+
+    def _at(self, values: np.ndarray) -> np.ndarray:
+        return values if self.at is None else values[:, self.steps - 1]
 
     @property
     def unit(self) -> str:
@@ -71,15 +80,16 @@ class PredictionView:
         """Standard errors of the values where they are sampled, shape (links, steps)."""
         errors = self.prediction.standard_error(self.metric, self.agent)
         if errors is None or self.baseline is None:
-            return errors
-        return self._normalised(errors, self.baseline.values(self.metric, self.agent))
+            return None if errors is None else self._at(errors)
+        return self._at(self._normalised(errors, self.baseline.values(self.metric, self.agent)))
 
     def values(self) -> np.ndarray:
         """Values shown, shape (links, steps)."""
         if self.statistic != "mean":
-            return _finite(self.prediction.statistic(self.statistic, self.metric, self.agent))
+            return _finite(self._at(self.prediction.statistic(self.statistic, self.metric, self.agent)))
         values = self.prediction.values(self.metric, self.agent)
-        return _finite(self._normalised(values, self.baseline and self.baseline.values(self.metric, self.agent)))
+        by = self.baseline and self.baseline.values(self.metric, self.agent)
+        return _finite(self._at(self._normalised(values, by)))
 
     def overconfidence(self) -> str:
         """Return a sentence if more is claimed than is true by over 5 %, where both are known; else nothing."""
@@ -204,6 +214,13 @@ def _finite(values: np.ndarray) -> np.ndarray:
     return values
 
 
+def report(views: Sequence[PredictionView]) -> Report:
+    """Return one quantity of a prediction, or several side by side, in every form."""
+    if len(views) > 1:
+        return Report.of(views, side_table, side_csv, side_json, draw_side)
+    return Report.of(views[0], predict_table, predict_csv, predict_json, draw)
+
+
 def text_of(prediction: Prediction, of: str, agent: int | str) -> str:
     """Return the table of a prediction as text of any width."""
     view = PredictionView(prediction, metric(of, prediction.scenario.model), agent)
@@ -214,7 +231,7 @@ def predict_table(view: PredictionView) -> Table:
     """Return rows of link probabilities (or cases) against columns of steps."""
     p = view.prediction
     values, errors, steady = view.values(), view.errors(), view.steady()
-    columns = [f"k={k}" for k in p.steps] + (["steady"] if steady is not None else [])
+    columns = [f"k={k}" for k in view.steps] + (["steady"] if steady is not None else [])
     uniform = p.cases is None and _uniform(p)
     rows = []
     for i, µ in enumerate(p.link):
@@ -242,9 +259,9 @@ def predict_csv(view: PredictionView) -> str:
     rows = []
     for i, µ in enumerate(p.link):
         case = "" if p.cases is None else p.cases[i]
-        rows += [(*labels, case, float(µ), int(k), float(v)) for k, v in zip(p.steps, values[i], strict=True)]
+        rows += [(*labels, case, float(µ), int(k), float(v)) for k, v in zip(view.steps, values[i], strict=True)]
         if errors is not None:
-            new = slice(-len(p.steps), None)
+            new = slice(-len(view.steps), None)
             rows[new] = [(*row, float(error)) for row, error in zip(rows[new], errors[i], strict=True)]
         if steady is not None:
             rows.append((*labels, case, float(µ), "steady", float(steady[i])))
@@ -263,7 +280,7 @@ def predict_json(view: PredictionView) -> dict[str, Any]:
         "quantity": p.quantity,
         "metric": view.metric.name,
         "link": p.link.tolist(),
-        "steps": p.steps.tolist(),
+        "steps": view.steps.tolist(),
         "values": view.values().tolist(),
         "scenario": p.scenario.to_mapping(),
         "meta": {
@@ -296,7 +313,7 @@ def predict_json(view: PredictionView) -> dict[str, Any]:
         polynomials = p.polynomials(view.metric, view.agent)
         if polynomials is not None:
             # E(µ) = sum over c of coefficients[c] µ^c (1−µ)^(L−c), L + 1 = len(coefficients), one list per step
-            result["bernstein"] = [coefficients.tolist() for coefficients in polynomials]
+            result["bernstein"] = [polynomials[k - 1].tolist() for k in view.steps]
     if p.cases is not None:
         result["cases"] = list(p.cases)
     if steady is not None and p.steady_bound is not None:
@@ -317,7 +334,7 @@ def side_table(views: Sequence[PredictionView]) -> Table:
     rows = []
     for i, µ in enumerate(p.link):
         name = () if p.cases is None else (p.cases[i],)
-        for k, step in enumerate(p.steps):
+        for k, step in enumerate(views[0].steps):
             cells = [
                 number(value[i, k], views[0].digits) + ("" if error is None else f" ±{error[i, k]:.2g}")
                 for value, error in zip(values, errors, strict=True)
@@ -351,12 +368,6 @@ def side_json(views: Sequence[PredictionView]) -> dict[str, Any]:
     }
 
 
-def plot_side(views: Sequence[PredictionView], output: Path) -> None:
-    """Draw the quantities against link probability, colour by step, or against the step where there is one row."""
-    figure = draw_side(views)
-    write_file(output, lambda path: figure.savefig(path, dpi=150))
-
-
 def draw_side(views: Sequence[PredictionView]):
     """Return the figure, one panel for each unit."""
     from matplotlib import colormaps
@@ -366,8 +377,9 @@ def draw_side(views: Sequence[PredictionView]):
     p = views[0].prediction
     against_link = p.cases is None and len(p.link) > 1
     order = np.argsort(p.link)
-    chosen = spread(len(p.steps)) if against_link else spread(len(p.link))
-    names = [f"k = {k}" for k in p.steps] if against_link else list(p.cases or [f"mean µ = {µ:.3g}" for µ in p.link])
+    steps = views[0].steps
+    chosen = spread(len(steps)) if against_link else spread(len(p.link))
+    names = [f"k = {k}" for k in steps] if against_link else list(p.cases or [f"mean µ = {µ:.3g}" for µ in p.link])
     units = list(dict.fromkeys(_axis(view) for view in views))
     figure = figure_class()(figsize=(1.5 + 5.0 * len(units), 5.2), layout="constrained")
     panels = dict(zip(units, figure.subplots(1, len(units), squeeze=False)[0], strict=True))
@@ -375,7 +387,7 @@ def draw_side(views: Sequence[PredictionView]):
     for v, view in enumerate(views):
         axes, values, errors = panels[_axis(view)], view.values(), view.errors()
         for c, color in zip(chosen, colors, strict=True):
-            x, y = (p.link[order], values[order, c]) if against_link else (p.steps, values[c])
+            x, y = (p.link[order], values[order, c]) if against_link else (steps, values[c])
             bars = None if errors is None else 1.96 * (errors[order, c] if against_link else errors[c])
             marker = MARKERS[v] if len(x) <= 30 else None
             axes.errorbar(x, y, bars, color=color, linestyle=STYLES[v % 4], marker=marker, markersize=4, capsize=2)
@@ -406,18 +418,6 @@ def _axis(view: PredictionView) -> str:
     return RATIO if view.prediction.quantity == "consistency" else view.axis
 
 
-def plot_prediction(view: PredictionView, output: Path) -> None:
-    """Draw the values against link probability, one curve per step, or against the step where rows are cases.
-
-    Raises
-    ------
-    StochfuseError
-        If matplotlib is not installed.
-    """
-    figure = draw(view)
-    write_file(output, lambda path: figure.savefig(path, dpi=150))
-
-
 def draw(view: PredictionView):
     """Return the figure, not shown and not registered with pyplot."""
     Figure = figure_class()
@@ -428,14 +428,14 @@ def draw(view: PredictionView):
     figure = Figure(figsize=(7.5, 5.0), layout="constrained")
     axes = figure.add_subplot()
     if p.cases is None and len(p.link) > 1:
-        chosen = spread(len(p.steps))
-        curves = [(f"k = {p.steps[i]}", p.link[order], values[order, i]) for i in chosen]
+        chosen = spread(len(view.steps))
+        curves = [(f"k = {view.steps[i]}", p.link[order], values[order, i]) for i in chosen]
         axes.set_xlabel("link probability µ")
-        legend = "step" if len(chosen) == len(p.steps) else f"step ({len(chosen)} of {len(p.steps)})"
+        legend = "step" if len(chosen) == len(view.steps) else f"step ({len(chosen)} of {len(view.steps)})"
     else:
         chosen = spread(len(p.link))
         names = p.cases or [f"mean µ = {µ:.3g}" for µ in p.link]
-        curves = [(names[i], p.steps, values[i]) for i in chosen]
+        curves = [(names[i], view.steps, values[i]) for i in chosen]
         axes.set_xlabel("step k")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         legend = "links" if len(chosen) == len(p.link) else f"links ({len(chosen)} of {len(p.link)})"

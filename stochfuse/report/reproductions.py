@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 from textwrap import wrap
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from stochfuse import __version__
 from stochfuse.report.plot import MARKERS, figure_class
-from stochfuse.report.table import Table, number, to_csv, write_file
+from stochfuse.report.table import Report, Table, number, to_csv
 
 SCHEMA = "stochfuse.reproduction/1"
 VERDICTS = ("agrees", "differs", "explained", "open")
@@ -141,6 +141,24 @@ def sheet_tables(sheet: Sheet, digits: int = 5) -> list[Table]:
     return [*tables, findings_table(sheet.findings, everywhere=False)] if sheet.findings else tables
 
 
+def sheet_report(sheet: Sheet, digits: int = 5) -> Report:
+    """Return an item in every form; its figure only where it has panels."""
+    figure = partial(draw, sheet) if sheet.panels else None
+    return Report(partial(sheet_tables, sheet, digits), partial(sheet_csv, [sheet]), partial(sheet_json, sheet), figure)
+
+
+def findings_report(findings: Sequence[Finding], title: Sequence[str] = ()) -> Report:
+    """Return statements of the thesis beside our numbers in every form."""
+    table = partial(findings_table, findings, title)
+    return Report(table, partial(findings_csv, findings), partial(findings_json, findings))
+
+
+def listing_report(entries: Sequence[tuple[str, str]]) -> Report:
+    """Return what can be reproduced in every form."""
+    csv = partial(to_csv, ("key", "title"), entries)
+    return Report(partial(listing_table, entries), csv, partial(listing_json, entries))
+
+
 def findings_table(findings: Sequence[Finding], title: Sequence[str] = (), *, everywhere: bool = True) -> Table:
     """Return the statements of the thesis beside our numbers, with verdicts.
 
@@ -244,12 +262,6 @@ def _panel_json(panel: Panel) -> dict[str, Any]:
     ]
     axes = {"x_label": panel.x_label, "y_label": panel.y_label, "x": panel.x.tolist()}
     return {"title": panel.title, **axes, "points": list(panel.points), "curves": curves}
-
-
-def plot_sheet(sheet: Sheet, output: Path) -> None:
-    """Draw an item on the thesis' axes, a panel beside the other."""
-    figure = draw(sheet)
-    write_file(output, lambda path: figure.savefig(path, dpi=150))
 
 
 def draw(sheet: Sheet):

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
@@ -21,7 +20,7 @@ from stochfuse.questions.question import Question, described, named
 from stochfuse.questions.sensitivity import Sensitivity, ShareOfGain
 from stochfuse.report.plot import MARKERS, figure_class, spread
 from stochfuse.report.predictions import PredictionView
-from stochfuse.report.table import Table, number, to_csv, write_file
+from stochfuse.report.table import Report, Table, number, to_csv
 
 SCHEMA = "stochfuse.solution/1"
 PRECISE = 12
@@ -68,6 +67,11 @@ class SolutionSheet:
         """The answer in words, and what it is about."""
         when = "" if self.kind == "gain" and self.question.step is not None else f"; {self.question.when}"
         return (*self.answer, self.view.what + when, self.view.whom, self.view.how)
+
+
+def solution_report(sheet: SolutionSheet, found: Any) -> Report:
+    """Return an answer in every form."""
+    return Report.of(sheet, solution_table, solution_csv, solution_json, lambda _: draw(sheet, found))
 
 
 def solution_table(sheet: SolutionSheet) -> Table:
@@ -344,18 +348,6 @@ def _blank(value: float | None) -> float | str:
 
 
 MOST_BARS = 12
-
-
-def plot_solution(sheet: SolutionSheet, found: Any, output: Path) -> None:
-    """Draw an answer.
-
-    Raises
-    ------
-    StochfuseError
-        If matplotlib is not installed.
-    """
-    figure = draw(sheet, found)
-    write_file(output, lambda path: figure.savefig(path, dpi=150))
 
 
 def draw(sheet: SolutionSheet, found: Any) -> Any:

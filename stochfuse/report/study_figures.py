@@ -15,13 +15,14 @@ Accuracy against message load as a figure: all points of a study, and the front 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from functools import partial
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from stochfuse.errors import UsageError
+from stochfuse.report import studies
 from stochfuse.report.plot import COLORS, MARKERS, figure_class, spread
 from stochfuse.report.predictions import counted
 from stochfuse.report.studies import LONGEST, load_label, shortened, spoken, whose, words_of
@@ -37,7 +38,7 @@ from stochfuse.report.study_slices import (
     sliced,
     thinned,
 )
-from stochfuse.report.table import number, write_file
+from stochfuse.report.table import Report, number
 from stochfuse.studies.pareto import ParetoFront
 from stochfuse.studies.plan import NODES, Axis
 
@@ -45,43 +46,36 @@ if TYPE_CHECKING:
     from stochfuse.studies.files import Results
 
 
-__all__ = ["draw", "plot_over", "plot_pareto"]
-
 KINDS = ("heat", "contour")
 STYLES = ("-", "--", ":", "-.")
 MANY = 1000
 """Scattered points from which on they are drawn small, and as pixels even in vector files."""
 
 
-def plot_over(
-    results: Results,
-    keys: Sequence[str] | None,
-    column: str | None,
-    kind: str,
-    where: Mapping[str, Any] | None,
-    step: int | None,
-    file: Path,
-) -> None:
-    """Draw a value column over one or two keys into a PNG, SVG or PDF file.
+def summary_report(results: Results, digits: int, drawn: tuple[Any, ...] = ()) -> Report:
+    """Return what a study found in every form.
 
     Parameters
     ----------
-    results, keys, column, where, step : see `stochfuse.report.study_slices.sliced`.
-    kind : over two keys of a grid "heat", a cell for each point, or "contour", lines of equal value.  Points of lists
-        and Latin hypercubes are scattered; filled contours are laid under them where two ranges vary and nothing else.
-
-    Raises
-    ------
-    UsageError
-        If a name or value is unknown, a key of a grid varies that is neither shown nor fixed, contours are asked for
-        over words, or the file cannot be written.
-    NoAnswerError
-        If no point has a value.
-    StochfuseError
-        If matplotlib is not installed.
+    drawn : keys, column, kind, fixed values and step of the figure, see `draw`.
     """
-    figure = draw(results, keys, column, kind, where, step)
-    write_file(file, lambda path: figure.savefig(path, dpi=150))
+    table = partial(studies.summary_table, results, digits)
+    return Report(
+        table,
+        partial(studies.summary_csv, results),
+        partial(studies.summary_json, results),
+        partial(draw, results, *drawn),
+    )
+
+
+def pareto_report(found: ParetoFront, results: Results, digits: int) -> Report:
+    """Return a Pareto front in every form."""
+    return Report(
+        partial(studies.pareto_table, found, results, digits),
+        partial(studies.pareto_csv, found, results),
+        partial(studies.pareto_json, found, results),
+        partial(draw_pareto, found, results),
+    )
 
 
 def draw(
@@ -92,7 +86,24 @@ def draw(
     where: Mapping[str, Any] | None = None,
     step: int | None = None,
 ) -> Any:
-    """Return the figure that `plot_over` writes."""
+    """Draw a value column over one or two keys, and return the figure.
+
+    Parameters
+    ----------
+    results, keys, column, where, step : see `stochfuse.report.study_slices.sliced`.
+    kind : over two keys of a grid "heat", a cell for each point, or "contour", lines of equal value.  Points of lists
+        and Latin hypercubes are scattered; filled contours are laid under them where two ranges vary and nothing else.
+
+    Raises
+    ------
+    UsageError
+        If a name or value is unknown, a key of a grid varies that is neither shown nor fixed, or contours are asked for
+        over words.
+    NoAnswerError
+        If no point has a value.
+    StochfuseError
+        If matplotlib is not installed.
+    """
     Figure = figure_class()
     if kind not in KINDS:
         raise UsageError(f"kind: expected {' or '.join(KINDS)}, got {kind}")
@@ -445,22 +456,8 @@ APART, DIGIT = 0.02, 0.013
 """Shares of the axes: between the numbers of points, and of the width of a digit."""
 
 
-def plot_pareto(found: ParetoFront, results: Results, file: Path) -> None:
-    """Draw all points, and the front as a line of steps: the best accuracy at no more than so much load.
-
-    Raises
-    ------
-    UsageError
-        If the file cannot be written.
-    StochfuseError
-        If matplotlib is not installed.
-    """
-    figure = draw_pareto(found, results)
-    write_file(file, lambda path: figure.savefig(path, dpi=150))
-
-
 def draw_pareto(found: ParetoFront, results: Results) -> Any:
-    """Return the figure that `plot_pareto` writes."""
+    """Draw all points, and the front as a line of steps: the best accuracy at no more than so much load."""
     figure = figure_class()(figsize=(7.5, 5.6), layout="constrained")
     axes = figure.add_subplot()
     one_in = -(-found.compared // MOST_DRAWN)

@@ -13,8 +13,9 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich import box
 from rich.console import Console
@@ -44,6 +45,29 @@ class Table:
     def headings(self) -> tuple[str, ...]:
         """All headings, keys first."""
         return self.keys + self.columns
+
+
+class Report(NamedTuple):
+    """A result on its way to the reader, in every form; what is not asked for is not made.
+
+    Parameters
+    ----------
+    table : as a table, for a terminal, Markdown and LaTeX.
+    csv : as records, with everything that says what a number is.
+    json : as one object.
+    draw : as a figure, where there is one.
+    """
+
+    table: Callable[[], Table | Sequence[Table]]
+    csv: Callable[[], str]
+    json: Callable[[], Any]
+    draw: Callable[[], Any] | None = None
+
+    @classmethod
+    def of(cls, shown: Any, table: Callable, csv: Callable, json: Callable, draw: Callable | None = None) -> Report:
+        """Return a report of what the forms take."""
+        figure = None if draw is None else partial(draw, shown)
+        return cls(partial(table, shown), partial(csv, shown), partial(json, shown), figure)
 
 
 def number(value: float, digits: int = 5) -> str:
@@ -177,8 +201,10 @@ def to_latex(table: Table) -> str:
     )
 
 
-def render(table: Table, format: str, width: int) -> str:
-    """Return the table as text of a width, Markdown or LaTeX."""
+def render(table: Table | Sequence[Table], format: str, width: int) -> str:
+    """Return a table, or several below each other, as text of a width, Markdown or LaTeX."""
+    if not isinstance(table, Table):
+        return "\n".join(render(each, format, width) for each in table)
     if format == "markdown":
         return to_markdown(table)
     return to_latex(table) if format == "latex" else to_text(table, width)

@@ -32,6 +32,7 @@ class EstimatorEntry(NamedTuple):
     weighs : whether its weights minimise a criterion.
     own_states, own_filters : whether agents may have states, or filters of a common state, of their own.
     footprints : whether it carries its error along as coefficients on all noises.
+    cites : keys of its sources beside the thesis, see `stochfuse.report.citations`.
     """
 
     name: str
@@ -44,6 +45,7 @@ class EstimatorEntry(NamedTuple):
     own_states: bool = False
     own_filters: bool = False
     footprints: bool = True
+    cites: tuple[str, ...] = ()
 
 
 class EngineEntry(NamedTuple):
@@ -127,6 +129,7 @@ ESTIMATOR = (
         "Julier and Uhlmann 1997",
         " of covariance intersection",
         ("intersection", "CovarianceIntersection"),
+        cites=("julier1997",),
         weighs=True,
         own_states=True,
     ),
@@ -136,6 +139,7 @@ ESTIMATOR = (
         "patent on split covariance intersection",
         " of split covariance intersection",
         ("intersection", "SplitCovarianceIntersection"),
+        cites=("julier2004",),
         weighs=True,
         own_states=True,
     ),
@@ -145,6 +149,7 @@ ESTIMATOR = (
         "parallel filters, (19)–(30)",
         " of a tree of blenders",
         ("blender", "Blender"),
+        cites=("layh2017",),
         own_filters=True,
     ),
     EstimatorEntry(
@@ -153,6 +158,7 @@ ESTIMATOR = (
         "parallel filters, least trace of all",
         " of the joint blender",
         ("blender", "JointBlender"),
+        cites=("layh2017",),
         own_filters=True,
     ),
     EstimatorEntry(
@@ -161,6 +167,7 @@ ESTIMATOR = (
         "extended Kalman filter with uncertain fusion",
         " of the equivalent measurement",
         ("equivalent", "EquivalentMeasurement"),
+        cites=("uncertain-fusion",),
         footprints=False,
     ),
     EstimatorEntry(
@@ -169,6 +176,7 @@ ESTIMATOR = (
         "the same with R taken for block diagonal",
         " of measurements taken for independent",
         ("equivalent", "IndependentMeasurements"),
+        cites=("uncertain-fusion",),
         footprints=False,
     ),
     EstimatorEntry(
@@ -177,6 +185,7 @@ ESTIMATOR = (
         "patent on cooperative estimators",
         " of LWIN",
         ("cooperative", "Lwin"),
+        cites=("li2021",),
         own_states=True,
     ),
     EstimatorEntry(
@@ -185,6 +194,7 @@ ESTIMATOR = (
         "patent on cooperative estimators, (27)",
         " of ITNS",
         ("cooperative", "Itns"),
+        cites=("li2021",),
         own_states=True,
         footprints=False,
     ),

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse.errors import Problem, ScenarioError, UsageError
+from stochfuse.errors import Problem, ScenarioError, UsageError, nearest
 from stochfuse.fusion.cooperative import Relation
 from stochfuse.kalman.checks import shown
 from stochfuse.kalman.metrics import metric as metric_of
@@ -221,8 +221,9 @@ def read_text(source: str | Path) -> tuple[str, str]:
     """Return name and text of a preset, a file or standard input."""
     if is_preset(source):
         return str(source), (_PRESETS / f"{source}.toml").read_text(encoding="utf-8")
-    known = ", ".join(preset_names())
-    return read_file(source, f"no such file, and no preset of that name (presets: {known})")
+    known = preset_names()
+    near = nearest(str(source), known)
+    return read_file(source, f"no such file, and no preset of that name{near} (presets: {', '.join(known)})")
 
 
 def read_file(source: str | Path, missing: str = "no such file") -> tuple[str, str]:

@@ -6,13 +6,13 @@ Whether the numbers fit together (shapes, definiteness, probabilities) is checke
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
 
-from stochfuse.errors import Problem
+from stochfuse.errors import Problem, nearest
 from stochfuse.kalman.checks import shown
 
 Number = Annotated[int, Strict()] | Annotated[float, Strict()]
@@ -286,7 +286,7 @@ def problems_of(
         structure.model_validate(mapping)
     except ValidationError as error:
         for entry in error.errors(include_url=False, include_context=True):
-            problem = _problem(entry)
+            problem = _problem(structure, entry)
             for path, words in expected.items():
                 if problem.path == path or problem.path.startswith((f"{path}.", f"{path}[")):
                     got = "nothing" if entry["type"] == "missing" else _got(entry, [])
@@ -295,7 +295,27 @@ def problems_of(
     return list(problems.values())
 
 
-def _problem(entry: Any) -> Problem:
+def keys_of(structure: type[BaseModel], path: Sequence[Any]) -> list[str]:
+    """Keys that the table at a path within a structure takes, as files have them; none where it is no table."""
+    for part in path:
+        if isinstance(part, int):
+            continue
+        fields = {field.alias or name: field.annotation for name, field in structure.model_fields.items()}
+        inside = _tables(fields.get(part))
+        if not inside:
+            return []
+        structure = inside[0]
+    return [field.alias or name for name, field in structure.model_fields.items()]
+
+
+def _tables(annotation: Any) -> list[type[BaseModel]]:
+    """Tables within an annotation: of `list[Agent] | None` Agent."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [table for part in get_args(annotation) for table in _tables(part)]
+
+
+def _problem(structure: type[BaseModel], entry: Any) -> Problem:
     location = list(entry["loc"])
     if location[:2] == ["noise", "correlation"]:
         return Problem("noise.correlation", _SHAPES["correlation"], _got(entry, location[2:]))
@@ -311,7 +331,7 @@ def _problem(entry: Any) -> Problem:
     else:
         expected = _KINDS.get(kind, str(entry["msg"]))
     if kind == "extra_forbidden":
-        got = f"an unknown one, '{location[-1]}'"
+        got = f"an unknown one, '{location[-1]}'{nearest(str(location[-1]), keys_of(structure, location[:-1]))}"
     else:
         got = "nothing" if kind == "missing" else shown(entry["input"])
     return Problem(_path(location) or "scenario", expected, got)

@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
-from stochfuse.errors import UsageError
+from stochfuse.errors import UsageError, nearest
 from stochfuse.report.reproductions import Finding, Panel, Sheet
 from stochfuse.scenario.registry import LFG, NAIVE, SIMPLIFIED
 from stochfuse.thesis import about_covariance, about_errors, about_messages, about_methods, about_records
@@ -192,7 +192,7 @@ def find(name: str) -> Item:
         raise UsageError(f"reproduce: {key.replace('-', ' ')} {NOT_COVERED[key]}; it has no numbers to calculate")
     raise UsageError(
         f"reproduce: expected figure-19 to figure-62, figure-65 to figure-72, table-2 to table-4, statements, all or "
-        f"timing, got '{name}'"
+        f"timing, got '{name}'{nearest(name, (item.key for item in catalogue()))}"
     )
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from time import perf_counter
 from typing import Any
 
 from stochfuse import __version__
 from stochfuse.prediction.predict import predict
 from stochfuse.report.reproductions import SCHEMA
-from stochfuse.report.table import Table
+from stochfuse.report.table import Report, Table, to_csv
 from stochfuse.scenario.registry import GENERAL, MONTE_CARLO, SIMPLIFIED
 from stochfuse.scenario.scenario import load_scenario
 
@@ -39,6 +40,11 @@ class Timing:
             (work, "-" if there is None else f"{there:,.0f}", f"{here:.4g}") for work, there, here in self.rows
         )
         return Table(title, ("work",), ("thesis [s]", "here [s]"), cells)
+
+    def report(self) -> Report:
+        """Return it in every form."""
+        csv = partial(to_csv, ("work", "thesis_s", "here_s"), self.rows)
+        return Report(self.table, csv, self.to_mapping)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the same for programs."""

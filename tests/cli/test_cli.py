@@ -287,7 +287,7 @@ BAD = [
     (["derive", "--q", "abc"], "error: q: expected a number, got 'abc'"),
     (["derive", "guess"], "Invalid value for"),
     (["scenario", "check", "nothing.toml"], "no such file"),
-    (["nonsense"], "No such command 'nonsense'"),
+    (["nonsense"], "no command 'nonsense'; commands: predict, compare"),
 ]
 
 

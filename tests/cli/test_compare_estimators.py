@@ -9,16 +9,10 @@ import numpy as np
 import pytest
 
 import stochfuse as sf
-from stochfuse.cli.options import Criterion, Estimator
 from stochfuse.errors import UsageError
 from stochfuse.report.comparisons import EstimatorView, draw_estimators
 from stochfuse.scenario.registry import CRITERIA, ESTIMATORS
 from tests.cli.command import run, strict_json
-
-
-def test_the_command_line_knows_the_names():
-    assert tuple(e.value for e in Estimator) == ESTIMATORS
-    assert tuple(c.value for c in Criterion) == CRITERIA
 
 
 def test_all_estimators_on_one_lossy_network():
@@ -130,7 +124,7 @@ def test_figure(against):
         (["beacon-map", "--estimator", "naive,lwin"], "estimator naive: expected agents that track one state"),
         (["parallel-filters", "--estimator", "split-ci,blender"], "estimator split-ci: expected one model for all"),
         (["--estimator", "naive,blender", "--criterion", "trace"], "--criterion: expected estimator covariance-inter"),
-        (["--criterion", "size"], "'size' is not one of 'det', 'trace', 'max-eig'"),
+        (["--criterion", "size"], "expected one of det, trace, max-eig, got 'size'"),
     ],
 )
 def test_wrong_use(arguments, message):

@@ -11,6 +11,7 @@ import pytest
 import stochfuse as sf
 from stochfuse.estimators.fusion_graph import FusionGraph, History, Message, load_history
 from stochfuse.report import fusion_graph as report
+from stochfuse.report.plot import save
 from tests.oracles import strategies, textbook
 
 
@@ -259,7 +260,7 @@ def test_figure_of_a_graph(example, tmp_path):
     figure = report.draw(graph, graph.explain(1, 4))
     texts = {t.get_text() for t in figure.axes[0].texts}
     assert {"1,1", "2,2", "3,4", "1,4f"} <= texts
-    report.plot(graph, graph.explain(1, 4), tmp_path / "graph.svg")
+    save(lambda: figure, tmp_path / "graph.svg")
     assert "<svg" in (tmp_path / "graph.svg").read_text()
 
 

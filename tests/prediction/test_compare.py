@@ -9,6 +9,7 @@ import stochfuse as sf
 from stochfuse.kalman.metrics import metric
 from stochfuse.prediction.compare import compare
 from stochfuse.report import comparisons
+from stochfuse.report.plot import save
 from stochfuse.report.predictions import PredictionView
 
 
@@ -60,7 +61,7 @@ def test_figure(found, tmp_path):
     left, right = figure.axes
     assert len(left.lines) >= 4 * 3
     assert right.get_ylabel() == "difference from general"
-    comparisons.plot_comparison(view(found), tmp_path / "compare.pdf")
+    save(comparisons.comparison_report(view(found)).draw, tmp_path / "compare.pdf")
     assert (tmp_path / "compare.pdf").stat().st_size > 1000
 
 

@@ -21,6 +21,7 @@ from stochfuse.cli.app import app
 from stochfuse.kalman.metrics import metric
 from stochfuse.questions.messages import accuracy, in_bytes, like_agents, message_load, node_bytes
 from stochfuse.report import messages as reports
+from stochfuse.report.plot import save
 from stochfuse.scenario.network import uniform_rows
 from stochfuse.scenario.scenario import link_rows
 from stochfuse.thesis.bench import TABLE_3, table_3_rows
@@ -415,7 +416,7 @@ def test_csv_and_json_carry_the_same():
 def test_figures(kind, tmp_path):
     figure = reports.draw(view(kind))
     assert len(figure.axes[0].get_legend_handles_labels()[1]) == (4 if kind in ("cdf", "distribution") else 2)
-    reports.plot_load(view(kind), tmp_path / "load.svg")
+    save(reports.load_report(view(kind)).draw, tmp_path / "load.svg")
     assert (tmp_path / "load.svg").stat().st_size > 1000
 
 

@@ -19,8 +19,9 @@ from hypothesis import strategies as st
 
 from stochfuse.errors import NoAnswerError, UsageError
 from stochfuse.report import studies
+from stochfuse.report.plot import save
 from stochfuse.report.studies import shortened, spoken
-from stochfuse.report.study_figures import draw, draw_pareto, edges, levels_of, plot_over, plot_pareto
+from stochfuse.report.study_figures import draw, draw_pareto, edges, levels_of, pareto_report, summary_report
 from stochfuse.report.study_slices import thinned
 from stochfuse.report.table import to_text
 from stochfuse.studies.pareto import Front, front, pareto, rounded
@@ -712,8 +713,8 @@ def test_pareto_figure_shows_confidence_of_sampled_points():
 def test_figures_are_written_whole(tmp_path, suffix):
     results = study([LINK, AGENTS], failed=(3,))
     first, second = tmp_path / f"over.{suffix}", tmp_path / f"front.{suffix}"
-    plot_over(results, None, None, "heat", None, None, first)
-    plot_pareto(pareto(results), results, second)
+    save(summary_report(results, 5).draw, first)
+    save(pareto_report(pareto(results), results, 5).draw, second)
     start = {"png": b"\x89PNG", "svg": b"<?xml", "pdf": b"%PDF"}[suffix]
     assert all(file.read_bytes().startswith(start) for file in (first, second))
     assert {file.name for file in tmp_path.iterdir()} == {first.name, second.name}

@@ -13,7 +13,9 @@ from typer.testing import CliRunner
 import stochfuse as sf
 from stochfuse.cli import reproduce as command
 from stochfuse.cli.app import app
+from stochfuse.cli.options import Written
 from stochfuse.errors import UsageError
+from stochfuse.report import plot
 from stochfuse.report import reproductions as report
 from stochfuse.scenario.registry import LFG, NAIVE, SIMPLIFIED
 from stochfuse.thesis import Bench, about_covariance, about_errors, about_records, catalogue, find, sheet
@@ -417,8 +419,8 @@ def test_wrong_requests(arguments, message, tmp_path, monkeypatch):
 
 def test_everything_goes_into_a_directory(tmp_path, monkeypatch):
     drawn = []
-    monkeypatch.setattr(report, "plot_sheet", lambda sheet, path: drawn.append((sheet.key, path.name)))
-    command._everything(Bench(steps=2), tmp_path, None)
+    monkeypatch.setattr(plot, "save", lambda draw, path: drawn.append((draw.args[0].key, path.name)))
+    command._everything(Bench(steps=2), Written(output=tmp_path))
     keys = [item.key for item in catalogue()]
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(f"{key}.json" for key in [*keys, "statements"])
     assert drawn == [(key, f"{key}.png") for key in keys if key not in ("table-2", "table-4")]

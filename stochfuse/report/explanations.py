@@ -1,0 +1,144 @@
+"""What the words mean that outputs use: a paragraph each, from the registry where it declares them."""
+
+from __future__ import annotations
+
+from textwrap import fill
+from typing import NamedTuple
+
+from stochfuse.errors import UsageError, nearest
+from stochfuse.report.table import Report, Table, to_csv
+from stochfuse.scenario import capabilities, registry
+
+SCHEMA = "stochfuse.explanation/1"
+TERMS = {
+    "prior": "The estimate before the measurement of a step: predicted from the step before, k|k-1.",
+    "posterior": (
+        "The estimate after a step's measurement and fusion. Every table shows posteriors unless it says prior."
+    ),
+    "link probability": (
+        "µ: the probability that one message from one agent reaches another within a step. Without "
+        "bursts, messages are lost independently of each other and of the data."
+    ),
+    "exact": (
+        "An average over every outcome of which messages arrive, each with its probability; only rounding "
+        "is left, and its reach is checked."
+    ),
+    "approximate": (
+        "The mean field: after every step the average covariance stands for all outcomes, and the next "
+        "step goes on from it. Fast for any number of agents; within a few per cent of the exact average "
+        "where links are alike."
+    ),
+    "bound": "The value is proved to lie within the relative distance that a note gives.",
+    "sampled": (
+        "A mean over drawn outcomes; ± is one standard error, the next sample's mean lies within two of "
+        "them in 95 % of all cases."
+    ),
+    "pedigree": (
+        "Of an estimate: the set of measurements and first estimates that went into it. What two "
+        "pedigrees have in common must be counted once."
+    ),
+    "innovation": "What a measurement says beyond the prediction, z - H x; its covariance is H P H' + R.",
+    "NEES": (
+        "Normalised estimation error squared, e' P^-1 e. Its mean is the state's dimension where the "
+        "claim is true; more where it is overconfident."
+    ),
+    "NIS": "Normalised innovation squared, the same of the innovation; needs no truth.",
+    "mean field": "See approximate.",
+    "ad-hoc": "Every message reaches each agent that could hear it, or not, independently of the others.",
+    "broadcast": "A message reaches everyone, or no one.",
+    "cyclic": "Agents in a ring: each hears the next one only.",
+    "burst": (
+        "A link that remembers: good and bad states with a transition probability each (Gilbert, "
+        "Elliott), key network.burst."
+    ),
+    "delay": (
+        "Messages that arrive late, with given probabilities of 0, 1, … steps, key network.delay; they "
+        "are brought forward to the step in which they arrive."
+    ),
+    "consistency": (
+        "Actual divided by claimed: 1 where an estimator knows how good it is, more where it is "
+        "overconfident, less where it is cautious."
+    ),
+    "claimed": (
+        "What a filter believes of itself. It is true only if what it believes of its inputs is: a rule "
+        "that counts shared information twice claims too little."
+    ),
+    "actual": ("The covariance that an estimate's error truly has, worked out from what every noise came to in it."),
+    "optimal": (
+        "One Kalman filter over all measurements whose messages reached an agent, directly or through "
+        "others: no linear rule can do better with what arrived."
+    ),
+}
+
+
+class Explanation(NamedTuple):
+    """A word, what kind of thing it names, and a paragraph."""
+
+    word: str
+    kind: str
+    text: str
+
+
+def explanations() -> dict[str, Explanation]:
+    """Return every word that can be explained."""
+    found = [Explanation(e.name, "estimator", _sentences(e.title, f"Source: {e.source}")) for e in registry.ESTIMATOR]
+    found += [
+        Explanation(e.name, "method", _sentences(f"{e.title}: {e.help}", f"Source: {e.source}", f"Nature: {e.nature}"))
+        for e in registry.ENGINE
+    ]
+    shorts = [
+        Explanation(s.name, "method", f"Short for --estimator {s.estimator} --method {s.engine}.")
+        for s in registry.SHORT
+    ]
+    found += [Explanation(q.name, "quantity", _sentences(q.help)) for q in registry.QUANTITY]
+    found += [Explanation(m.name.partition(":")[0], "metric", _sentences(m.help)) for m in registry.METRIC]
+    found += [Explanation(s.name.partition(":")[0], "statistic", _sentences(s.help)) for s in registry.STATISTIC]
+    found += [
+        Explanation(
+            f.name,
+            "feature of a scenario",
+            _sentences(f"in a scenario file: {f.key}", "stochfuse methods --matrix shows what takes it"),
+        )
+        for f in capabilities.FEATURES
+    ]
+    known: dict[str, Explanation] = {}
+    for one in (*found, *shorts, *(Explanation(word, "term", text) for word, text in TERMS.items())):
+        before = known.get(one.word)
+        known[one.word] = (
+            one if before is None else Explanation(one.word, f"{before.kind}, {one.kind}", f"{before.text} {one.text}")
+        )
+    return known
+
+
+def explained(word: str | None, width: int) -> tuple[str, Report]:
+    """Return a word's paragraph as text of a width, and in every other form; of None all words.
+
+    Raises
+    ------
+    UsageError
+        If the word is not known; names the nearest.
+    """
+    known = explanations()
+    if word is None:
+        chosen = list(known.values())
+    else:
+        key = next((k for k in known if k.lower() == word.strip().lower()), None)
+        if key is None:
+            raise UsageError(
+                f"explain: expected a word that outputs use, got '{word}'{nearest(word, known)}; without one: all"
+            )
+        chosen = [known[key]]
+    text = (
+        "\n".join(fill(f"{one.word} ({one.kind}): {one.text}", width, subsequent_indent="  ") for one in chosen) + "\n"
+    )
+    keys = Explanation._fields
+    report = Report(
+        lambda: Table(("What the words mean",), keys, (), tuple(tuple(one) for one in chosen)),
+        lambda: to_csv(keys, chosen),
+        lambda: {"schema": SCHEMA, "explanations": [one._asdict() for one in chosen]},
+    )
+    return text, report
+
+
+def _sentences(*texts: str) -> str:
+    return " ".join(f"{text[0].upper()}{text[1:].rstrip('.')}." for text in texts)
