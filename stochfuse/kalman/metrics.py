@@ -107,9 +107,8 @@ def metric(name: str, model: Labelled) -> Metric:
 
 def _index(name: str, state: str, model: Labelled) -> int:
     if state not in model.states:
-        raise UsageError(
-            f"metric '{name}': no state '{state}'{nearest(state, model.states)}; the states are {', '.join(model.states)}"
-        )
+        near = nearest(state, model.states)
+        raise UsageError(f"metric '{name}': no state '{state}'{near}; the states are {', '.join(model.states)}")
     return model.states.index(state)
 
 
