@@ -242,7 +242,7 @@ def predict_table(view: PredictionView) -> Table:
         rows.append((*name, f"{µ:.6g}" if uniform else f"{µ:.4g}", *shown))
     mean = "µ" if uniform else "mean µ"
     keys = (mean,) if p.cases is None else ("links", mean)
-    return Table((view.what, view.whom, view.how), keys, tuple(columns), tuple(rows))
+    return Table((view.what, view.whom, view.how), keys, tuple(columns), tuple(rows), over="k")
 
 
 def _uniform(p: Prediction) -> bool:

@@ -76,7 +76,8 @@ def solution_report(sheet: SolutionSheet, found: Any) -> Report:
 
 def solution_table(sheet: SolutionSheet) -> Table:
     """Return the answer's table under what it means."""
-    return Table(sheet.titles, sheet.keys, sheet.columns, sheet.rows)
+    over = "k" if sheet.kind == "gain" else ""
+    return Table(sheet.titles, sheet.keys, sheet.columns, sheet.rows, over)
 
 
 def solution_csv(sheet: SolutionSheet) -> str:

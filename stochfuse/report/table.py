@@ -12,7 +12,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,12 +34,15 @@ class Table:
     keys : headings of the first columns, which name a row.
     columns : headings of the other columns.
     rows : cells as text, keys first.
+    over : what the columns run over, "k" for columns k=1, k=2, …, if they are numbers of one kind: such a table can be
+        turned.
     """
 
     title: tuple[str, ...]
     keys: tuple[str, ...]
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
+    over: str = ""
 
     @property
     def headings(self) -> tuple[str, ...]:
@@ -76,8 +79,12 @@ def number(value: float, digits: int = 5) -> str:
     return text[:-1] if text.endswith(".") else text
 
 
+MOST_ROWS = 400
+"""Rows that a table for a terminal shows; beyond that the middle is left out."""
+
+
 def to_text(table: Table, width: int | None = 80) -> str:
-    """Return the table for a terminal of some width; what does not fit beside is put below.  No width: one table."""
+    """Return the table for a terminal of some width, turned if it is too wide; no width: as it is."""
     output = io.StringIO()
     room = width or 1_000_000
     console = Console(
@@ -85,10 +92,13 @@ def to_text(table: Table, width: int | None = 80) -> str:
     )
     for line in table.title:
         console.print(line, soft_wrap=width is None)
+    table, left_out = _shortened(_fitting(table, room))
     text = [key and not all(_numeric(row[i]) for row in table.rows) for i, key in enumerate(_is_key(table))]
-    for columns in _blocks(table, text, room):
+    columns = [[row[i] for row in table.rows] if text[i] else _aligned(table, i) for i in range(len(text))]
+    table = replace(table, rows=tuple(zip(*columns, strict=True)) if table.rows else ())
+    for block in _blocks(table, text, room):
         rich = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1))
-        for index in columns:
+        for index in block:
             # a number must never be cut: it keeps its width whatever the terminal; words may wrap
             rich.add_column(
                 table.headings[index],
@@ -98,9 +108,51 @@ def to_text(table: Table, width: int | None = 80) -> str:
                 min_width=_width(table, index) if not text[index] else _longest_word(table, index),
             )
         for row in table.rows:
-            rich.add_row(*(row[index] for index in columns))
+            rich.add_row(*(row[index] for index in block))
         console.print(rich, crop=False, no_wrap=False)
+    if left_out:
+        console.print(f"… {left_out:,} rows in the middle are left out; --at picks steps, --format csv has them all")
     return "\n".join(line.rstrip() for line in output.getvalue().split("\n")).rstrip("\n") + "\n"
+
+
+def _fitting(table: Table, room: int) -> Table:
+    """The table, or where it is too wide its columns downwards: all beside each other, or one row for each number."""
+    if not table.over or _total(table) <= room:
+        return table
+    names = [column.removeprefix(f"{table.over}=") for column in table.columns]
+    n = len(table.keys)
+    turned = replace(
+        table,
+        keys=(table.over,),
+        columns=tuple(f"{table.keys[0]}={row[0]}" if n == 1 else row[0] for row in table.rows),
+        rows=tuple((name, *(row[n + i] for row in table.rows)) for i, name in enumerate(names)),
+    )
+    if _total(turned) <= room:
+        return turned
+    rows = tuple((*row[:n], name, row[n + i]) for row in table.rows for i, name in enumerate(names))
+    return replace(table, keys=(*table.keys, table.over), columns=("value",), rows=rows)
+
+
+def _total(table: Table) -> int:
+    return sum(_width(table, i) + 3 for i in range(len(table.headings)))
+
+
+def _shortened(table: Table) -> tuple[Table, int]:
+    """The table with at most `MOST_ROWS` rows, and how many are left out."""
+    left = len(table.rows) - MOST_ROWS
+    if left <= 0:
+        return table, 0
+    half = MOST_ROWS // 2
+    gap = ("…",) * len(table.headings)
+    return replace(table, rows=(*table.rows[:half], gap, *table.rows[-half:])), left
+
+
+def _aligned(table: Table, index: int) -> list[str]:
+    """Cells of a column of numbers, padded so that decimal points lie below each other."""
+    parts = [row[index].partition(".") for row in table.rows]
+    before = max((len(whole) for whole, _, _ in parts), default=0)
+    after = max((len(point + rest) for _, point, rest in parts), default=0)
+    return [f"{whole:>{before}}{point + rest:<{after}}" for whole, point, rest in parts]
 
 
 def _numeric(cell: str) -> bool:
