@@ -93,9 +93,7 @@ def to_text(table: Table, width: int | None = 80) -> str:
     for line in table.title:
         console.print(line, soft_wrap=width is None)
     table, left_out = _shortened(_fitting(table, room))
-    text = [key and not all(_numeric(row[i]) for row in table.rows) for i, key in enumerate(_is_key(table))]
-    columns = [[row[i] for row in table.rows] if text[i] else _aligned(table, i) for i in range(len(text))]
-    table = replace(table, rows=tuple(zip(*columns, strict=True)) if table.rows else ())
+    table, text = _aligned(table), _words(table)
     for block in _blocks(table, text, room):
         rich = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1))
         for index in block:
@@ -134,6 +132,7 @@ def _fitting(table: Table, room: int) -> Table:
 
 
 def _total(table: Table) -> int:
+    table = _aligned(table)
     return sum(_width(table, i) + 3 for i in range(len(table.headings)))
 
 
@@ -147,12 +146,23 @@ def _shortened(table: Table) -> tuple[Table, int]:
     return replace(table, rows=(*table.rows[:half], gap, *table.rows[-half:])), left
 
 
-def _aligned(table: Table, index: int) -> list[str]:
-    """Cells of a column of numbers, padded so that decimal points lie below each other."""
-    parts = [row[index].partition(".") for row in table.rows]
-    before = max((len(whole) for whole, _, _ in parts), default=0)
-    after = max((len(point + rest) for _, point, rest in parts), default=0)
-    return [f"{whole:>{before}}{point + rest:<{after}}" for whole, point, rest in parts]
+def _words(table: Table) -> list[bool]:
+    """Whether a column holds words, which may wrap."""
+    return [key and not all(_numeric(row[i]) for row in table.rows) for i, key in enumerate(_is_key(table))]
+
+
+def _aligned(table: Table) -> Table:
+    """The table with numbers padded so that the decimal points of a column lie below each other."""
+    if not table.rows:
+        return table
+    columns = []
+    for column, words in zip(zip(*table.rows, strict=True), _words(table), strict=True):
+        parts = [cell.partition(".") for cell in column]
+        before = max(len(whole) for whole, _, _ in parts)
+        after = max(len(point + rest) for _, point, rest in parts)
+        padded = [f"{whole:>{before}}{point + rest:<{after}}" for whole, point, rest in parts]
+        columns.append(column if words else padded)
+    return replace(table, rows=tuple(zip(*columns, strict=True)))
 
 
 def _numeric(cell: str) -> bool:
