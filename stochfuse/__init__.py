@@ -6,6 +6,7 @@
     >>> p.covariance.shape                     # link, step, state, state
     (3, 5, 1, 1)
 
+`sf.kalman` and `sf.fusion` are doors to the filter's equations and to the rules of fusion for arrays of one's own.
 Names are loaded when first used, so that the command line starts without what it does not need.
 """
 
@@ -120,14 +121,16 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
+    if name in ("fusion", "kalman"):
+        return import_module(f"stochfuse.{name}")
     if name not in _HOME:
         raise AttributeError(f"module 'stochfuse' has no attribute '{name}'")
     return getattr(import_module(f"stochfuse.{_HOME[name]}"), name)
 
 
-def as_text(prediction: Any, of: str, agent: int | str) -> str:
-    """Return a prediction's table as text; the door through which a result reaches what shows it."""
-    return import_module("stochfuse.report.predictions").text_of(prediction, of, agent)
+def shown(name: str, *args: Any, **kwargs: Any) -> Any:
+    """Call a function of `stochfuse.report.results`: the door through which a result reaches what shows it."""
+    return getattr(import_module("stochfuse.report.results"), name)(*args, **kwargs)
 
 
 def __dir__() -> list[str]:

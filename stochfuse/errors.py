@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 def nearest(word: str, known: Iterable[str]) -> str:
     """Return ` (did you mean 'claimed'?)` where one of the known words is near, else nothing."""
-    found = get_close_matches(word, list(known), n=1)
+    found = get_close_matches(str(word), list(known), n=1)
     return f" (did you mean '{found[0]}'?)" if found else ""
 
 

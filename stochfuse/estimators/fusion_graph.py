@@ -130,6 +130,13 @@ def load_history(source: str | Path = "thesis-example") -> History:
     ------
     ScenarioError
         If the file is missing or malformed, or naming every offending key.
+
+    Examples
+    --------
+    >>> import stochfuse as sf
+    >>> graph = sf.FusionGraph(sf.load_history("thesis-example"))
+    >>> len(graph.explain(agent=1, step=3).terms)
+    3
     """
     if source in history_names():
         text = (_HISTORIES / f"{source}.toml").read_text(encoding="utf-8")

@@ -76,7 +76,7 @@ class Fused(NamedTuple):
 
     Attributes
     ----------
-    c : mean (d, 1), None where the signals have none.
+    c : mean (d, 1), or (d,) where the first signal's is flat; None where the signals have none.
     C : covariance (d, d), which bounds the actual one.
     C1, C2 : its possibly correlated and its independent part, for two signals; else None.
     weights : (n,).
@@ -108,8 +108,8 @@ def split_covariance_intersection(
 
     Parameters
     ----------
-    signals : means, split covariances and maps; A1 + A2 positive definite, except that one of two plain estimates of
-        the whole state may be singular under "det" or "trace".
+    signals : means of shape (p, 1) or (p,), split covariances and maps; A1 + A2 positive definite, except that one of
+        two plain estimates of the whole state may be singular under "det" or "trace".
     criterion : what the weights make small; the determinant of C by default.
     weights : (n,) given weights instead of the best ones.
 
@@ -127,6 +127,8 @@ def split_covariance_intersection(
     stack, independent = _fuse(A1, A2, [s.H for s in checked], criterion, given)
     terms = [K[0] @ s.a for K, s in zip(stack.gains, checked, strict=True) if s.a is not None]
     c, C = (np.sum(terms, axis=0) if terms else None), stack.C[0]
+    if c is not None and np.ndim(signals[0][0]) == 1:
+        c = c[:, 0]  # as the means came
     split = (NUMPY.symmetric(C - independent[0]), independent[0]) if len(checked) == 2 else (None, None)
     return Fused(c, C, *split, stack.weights[0], float(stack.certificate[0]))
 
@@ -299,7 +301,7 @@ def covariance_part(name: str, value: Any, p: int | None) -> np.ndarray:
 
 
 def mean(name: str, value: Any, p: int, wanted: bool) -> np.ndarray | None:
-    """Read a mean (p, 1), or None where no signal has one."""
+    """Read a mean (p, 1) or (p,) as (p, 1), or None where no signal has one."""
     if (value is not None) != wanted:
         raise UsageError(
             f"{name}: expected a mean in every signal or in none, got {'none' if value is None else 'one'}"
@@ -307,6 +309,7 @@ def mean(name: str, value: Any, p: int, wanted: bool) -> np.ndarray | None:
     if value is None:
         return None
     a = np.asarray(value, dtype=float)
+    a = a[:, None] if a.ndim == 1 else a
     if a.shape != (p, 1) or not np.isfinite(a).all():
         raise UsageError(f"{name}: expected a finite column of shape ({p}, 1), got shape {a.shape}")
     return a

@@ -21,7 +21,7 @@ from stochfuse.errors import StochfuseError, TooManyError, UsageError, nearest
 from stochfuse.kalman.checks import covariance_fault
 from stochfuse.prediction.method import RUNS, Averaged, Settings, faults_of
 from stochfuse.prediction.quantities import QUANTITIES
-from stochfuse.prediction.result import Prediction
+from stochfuse.prediction.result import Prediction, Result
 from stochfuse.scenario import capabilities, registry
 from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.registry import (
@@ -36,7 +36,7 @@ from stochfuse.scenario.registry import (
     OPTIMAL,
     SIMPLIFIED,
 )
-from stochfuse.scenario.scenario import Scenario, link_rows
+from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario
 from stochfuse.scenario.system import Items, Noises, System
 
 COUNTS_AGAIN = "naive fusion counts shared information again and believes it; quantity actual is its true error"
@@ -51,6 +51,7 @@ WORTHLESS = 1e-3
 """Relative rounding beyond which it is no answer."""
 
 
+@of_scenario
 def predict(
     scenario: Scenario,
     link: Sequence[float] | np.ndarray | float | LinkRows | None = None,
@@ -93,6 +94,13 @@ def predict(
         If the request does not fit the scenario.
     NoAnswerError
         If a steady state is asked for and there is none.
+
+    Examples
+    --------
+    >>> import stochfuse as sf
+    >>> p = sf.predict("thesis-transient", [0, 0.5])
+    >>> p.values().round(3)[:, -1]
+    array([39.775, 26.271])
     """
     if (
         method is None
@@ -118,6 +126,7 @@ def predict(
     return prediction.with_steady(fixed.P, fixed.bound)
 
 
+@of_scenario
 def predict_several(
     scenario: Scenario,
     link: Sequence[float] | np.ndarray | float | LinkRows | None,
@@ -143,8 +152,8 @@ def predict_several(
     return [found[q] for q in quantities]
 
 
-@dataclass(frozen=True, eq=False)
-class Many:
+@dataclass(frozen=True, eq=False, repr=False)
+class Many(Result):
     """What became of many scenarios.
 
     Parameters
@@ -159,6 +168,7 @@ class Many:
     faults: Mapping[int, str]
 
 
+@of_scenario
 def predict_many(
     scenario: Scenario,
     link: Any = None,
@@ -191,6 +201,13 @@ def predict_many(
     ------
     UsageError
         If an array does not fit, or the method does not take the scenario.
+
+    Examples
+    --------
+    >>> import stochfuse as sf
+    >>> p = sf.predict_many("thesis-transient", link=[0.2, 0.8], R=[100.0, 400.0])
+    >>> p.values()[:, -1].round(3)
+    array([33.287, 50.832])
     """
     items = items_of(scenario, link, Noises(Q, R, P))
     found = predict_items(scenario, items, method, [quantity], **settings)
@@ -299,7 +316,9 @@ def _asked(scenario: Scenario, method: str | None, quantity: str, settings: Mapp
         method = registry.OPTIMAL
     unknown = set(settings) - set(Settings.__dataclass_fields__)
     if unknown:
-        raise TypeError(f"predict() got an unexpected keyword argument '{sorted(unknown)[0]}'")
+        wrong, known = sorted(unknown)[0], sorted(Settings.__dataclass_fields__)
+        near = nearest(wrong, known)
+        raise TypeError(f"predict() got an unexpected keyword argument '{wrong}'{near}; expected {', '.join(known)}")
     how = Settings(**{"estimator": scenario.estimator or LFG, "runs": scenario.runs or RUNS, **settings})
     choose("estimator", how.estimator, ESTIMATORS)
     choose("criterion", how.criterion, CRITERIA)

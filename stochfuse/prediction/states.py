@@ -35,9 +35,10 @@ from stochfuse.kalman.kernel import (
 from stochfuse.kalman.metrics import Moments
 from stochfuse.prediction import simplified
 from stochfuse.prediction.method import Averaged
+from stochfuse.prediction.result import brief
 from stochfuse.scenario.model import Sensor
 from stochfuse.scenario.network import LinkRows, possible_senders
-from stochfuse.scenario.scenario import Scenario, link_rows
+from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario
 from stochfuse.scenario.system import Items, System
 
 SELF_CONSISTENT = (
@@ -64,7 +65,12 @@ class States(NamedTuple):
     x: np.ndarray
     names: tuple[str, ...]
 
+    def __repr__(self) -> str:
+        """One line."""
+        return brief(self, self._fields)
 
+
+@of_scenario
 def predict_states(
     scenario: Scenario, measurements: Any, link: Sequence[float] | None = None, *, printed: bool = False
 ) -> States:
@@ -86,6 +92,13 @@ def predict_states(
     ------
     UsageError
         If the record does not fit the scenario.
+
+    Examples
+    --------
+    >>> import stochfuse as sf
+    >>> found = sf.predict_states(sf.load_scenario("thesis-transient", steps=2), [[0.0], [10.0]], [0.5])
+    >>> found.x.shape[:2]
+    (1, 2)
     """
     rows = link_rows(scenario, link)
     z = np.asarray(measurements, dtype=float)

@@ -30,9 +30,10 @@ from stochfuse.errors import NoAnswerError, UsageError
 from stochfuse.kalman.averaged_update import basis, triangle
 from stochfuse.kalman.kernel import at_step
 from stochfuse.prediction import simplified
+from stochfuse.prediction.result import brief
 from stochfuse.scenario.model import Model, Sensor
 from stochfuse.scenario.network import LinkRows
-from stochfuse.scenario.scenario import Scenario, link_rows
+from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario
 from stochfuse.scenario.system import Items
 
 TOLERANCE = 1e-12
@@ -61,7 +62,12 @@ class SteadyState(NamedTuple):
     residual: np.ndarray
     bound: np.ndarray
 
+    def __repr__(self) -> str:
+        """One line."""
+        return brief(self, self._fields)
 
+
+@of_scenario
 def steady_state(scenario: Scenario, link: Sequence[float] | LinkRows | None = None) -> SteadyState:
     """Solve P = g_µ(P) for every row of link probabilities.
 
@@ -80,6 +86,13 @@ def steady_state(scenario: Scenario, link: Sequence[float] | LinkRows | None = N
         If the model, a sensor or a link varies with the step.
     NoAnswerError
         If the stand-alone filter diverges: an unstable mode is not observed.
+
+    Examples
+    --------
+    >>> import stochfuse as sf
+    >>> found = sf.steady_state("thesis-steady", [0.5])
+    >>> found.P.ravel().round(4)
+    array([26.1467])
     """
     rows = link if isinstance(link, LinkRows) else link_rows(scenario, link)
     sensors = scenario.sensors

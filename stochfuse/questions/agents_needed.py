@@ -9,12 +9,13 @@ says why), n is doubled until the target is met and then halved in: n* meets it 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import Any
 
 import numpy as np
 
 from stochfuse.errors import NoAnswerError, UsageError
-from stochfuse.prediction.result import Prediction
+from stochfuse.prediction.result import Prediction, Result
 from stochfuse.questions.question import (
     SLACK,
     Question,
@@ -25,14 +26,14 @@ from stochfuse.questions.question import (
     require_like_links,
 )
 from stochfuse.scenario.registry import OPTIMAL, SIMPLIFIED
-from stochfuse.scenario.scenario import Scenario
+from stochfuse.scenario.scenario import Scenario, of_scenario
 
 MOST_AGENTS = {SIMPLIFIED: 1_000_000, OPTIMAL: 100}
 """Agents up to which each method is asked."""
 
 
-@dataclass(frozen=True, eq=False)
-class AgentsNeeded:
+@dataclass(frozen=True, eq=False, repr=False)
+class AgentsNeeded(Result):
     """The least number of agents that meets a target.
 
     Parameters
@@ -59,6 +60,7 @@ class AgentsNeeded:
     bound: float = 0.0
 
 
+@of_scenario
 def agents_needed(
     scenario: Scenario, target: float, link: float, *, max_agents: int | None = None, **asked: Any
 ) -> AgentsNeeded:
@@ -76,6 +78,12 @@ def agents_needed(
         If agents or links differ, or the method is another.
     NoAnswerError
         If even the most agents miss the target; says what they reach.
+
+    Examples
+    --------
+    >>> import stochfuse as sf
+    >>> sf.agents_needed("thesis-transient", 25.0, 0.5).agents
+    4
     """
     check_target(target)
     if len(scenario.sensors) > 1 or "agent" in scenario.source:
@@ -88,8 +96,8 @@ def agents_needed(
             "would hear"
         )
     require_like_links(scenario)
-    if not 0 <= link <= 1:
-        raise UsageError(f"link: expected a probability between 0 and 1, got {link:g}")
+    if not isinstance(link, Real) or not 0 <= link <= 1:
+        raise UsageError(f"link: expected a probability between 0 and 1, got {link}")
     asked_for = question(scenario, **asked)
     if not asked_for.monotone:
         raise UsageError(

@@ -36,7 +36,7 @@ from scipy.special import chdtrc, fdtrc, stdtr
 from stochfuse.engines.distribution import Distribution
 from stochfuse.errors import UsageError
 from stochfuse.kalman.metrics import Metric
-from stochfuse.prediction.result import Prediction
+from stochfuse.prediction.result import Prediction, brief
 from stochfuse.questions.results import ResultsError, SimulatorResults
 
 if TYPE_CHECKING:
@@ -97,6 +97,10 @@ class Verdict(NamedTuple):
     p_largest: float
     p_together: float | None
     consistency: Mapping[str, float]
+
+    def __repr__(self) -> str:
+        """One line."""
+        return brief(self, self._fields)
 
 
 def check_results(results: SimulatorResults, prediction: Prediction, metric: Metric, alpha: float = ALPHA) -> Verdict:

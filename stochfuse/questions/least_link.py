@@ -46,7 +46,7 @@ from stochfuse.errors import NoAnswerError
 from stochfuse.kalman.algebra import FIELD
 from stochfuse.kalman.kernel import Estimate, at_step, predict
 from stochfuse.prediction.quantities import linear
-from stochfuse.prediction.result import Prediction
+from stochfuse.prediction.result import Prediction, Result
 from stochfuse.prediction.simplified import average, outcome
 from stochfuse.questions.question import (
     SLACK,
@@ -59,7 +59,7 @@ from stochfuse.questions.question import (
 )
 from stochfuse.scenario.network import number_of_senders
 from stochfuse.scenario.registry import OPTIMAL, SIMPLIFIED
-from stochfuse.scenario.scenario import Scenario
+from stochfuse.scenario.scenario import Scenario, of_scenario
 
 Function = Callable[[np.ndarray], np.ndarray]
 
@@ -228,8 +228,8 @@ ROUNDING, STEADY_ROUNDING = 4e-15, 1e-12
 """Relative rounding errors of values, and of steady states."""
 
 
-@dataclass(frozen=True, eq=False)
-class LeastLink:
+@dataclass(frozen=True, eq=False, repr=False)
+class LeastLink(Result):
     """The least link probability that meets a target.
 
     Parameters
@@ -281,6 +281,7 @@ class Expectation(NamedTuple):
     sections: int = SECTIONS
 
 
+@of_scenario
 def least_link(scenario: Scenario, target: float, **asked: Any) -> LeastLink:
     """Return the least µ, one for all links, at which the number asked about is at most the target.
 
@@ -296,6 +297,12 @@ def least_link(scenario: Scenario, target: float, **asked: Any) -> LeastLink:
         If the request does not fit the scenario.
     NoAnswerError
         If no µ meets the target; says what the best is.
+
+    Examples
+    --------
+    >>> import stochfuse as sf
+    >>> round(sf.least_link("thesis-transient", 30.0).link, 6)
+    0.326331
     """
     check_target(target)
     require_like_links(scenario)

@@ -26,18 +26,19 @@ from stochfuse.engines.events import events
 from stochfuse.errors import UsageError
 from stochfuse.prediction.method import RUNS, SEED
 from stochfuse.prediction.predict import choose, predict
+from stochfuse.prediction.result import Result
 from stochfuse.questions.message_chain import frequencies, like_agents, naive_load, sampled_loads, walked_load
 from stochfuse.scenario.network import LinkRows, require_memoryless
 from stochfuse.scenario.registry import GENERAL, LFG, MONTE_CARLO, NAIVE
-from stochfuse.scenario.scenario import Scenario, link_rows, require_one_state
+from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario, require_one_state
 
 RULES = (LFG, NAIVE)
 METHODS = ("exact", MONTE_CARLO)
 NUMBER_BYTES, IDENTITY_BYTES = 8, 8
 
 
-@dataclass(frozen=True, eq=False)
-class MessageLoad:
+@dataclass(frozen=True, eq=False, repr=False)
+class MessageLoad(Result):
     """Distribution of the load of one agent in one step.
 
     Parameters
@@ -140,6 +141,7 @@ class MessageLoad:
         raise UsageError(f"agent: expected mean or a number from 1 to {n}, got '{agent}'")
 
 
+@of_scenario
 def message_load(
     scenario: Scenario,
     link: Sequence[float] | np.ndarray | float | LinkRows | None = None,
@@ -167,6 +169,12 @@ def message_load(
     ------
     UsageError
         If the request does not fit the scenario, or the exact walk has too many states.
+
+    Examples
+    --------
+    >>> import stochfuse as sf
+    >>> sf.message_load("thesis-transient", [0.5]).mean().round(4)
+    array([1.6898])
     """
     choose("rule", rule, RULES)
     choose("method", method, METHODS)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import isfinite
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -152,8 +153,9 @@ def relative_bound(prediction: Prediction, row: int) -> float:
 
 def check_target(target: float) -> None:
     """Raise UsageError if a target is none."""
-    if not (isfinite(target) and target >= 0):
-        raise UsageError(f"target: expected a finite number of at least 0, got {target:g}")
+    if not isinstance(target, Real) or not (isfinite(target) and target >= 0):
+        got = f"{target:g}" if isinstance(target, Real) else repr(target)
+        raise UsageError(f"target: expected a finite number of at least 0, got {got}")
 
 
 def require_like_links(scenario: Scenario) -> None:

@@ -26,11 +26,11 @@ from numpy.polynomial import Chebyshev
 from stochfuse.engines.events import events
 from stochfuse.errors import NoAnswerError, StochfuseError, UsageError
 from stochfuse.prediction.quantities import linear
-from stochfuse.prediction.result import Prediction
+from stochfuse.prediction.result import Prediction, Result
 from stochfuse.questions.question import Question, described, question
 from stochfuse.scenario.network import LinkRows, uniform_rows
 from stochfuse.scenario.registry import SIMPLIFIED
-from stochfuse.scenario.scenario import Scenario
+from stochfuse.scenario.scenario import Scenario, of_scenario
 
 MOST_AGENTS = 12
 """Agents up to which every link is listed."""
@@ -42,8 +42,8 @@ TIE, TIED = 1e-12, 1e-9
 """Relative difference below which values, or derivatives, are the same."""
 
 
-@dataclass(frozen=True, eq=False)
-class Sensitivity:
+@dataclass(frozen=True, eq=False, repr=False)
+class Sensitivity(Result):
     """dE/dµ of every link.
 
     Parameters
@@ -80,6 +80,7 @@ class Sensitivity:
         return tuple(int(i) for i in can if self.derivative[i] <= best + margin)
 
 
+@of_scenario
 def sensitivity(
     scenario: Scenario, link: float | np.ndarray | None = None, *, case: str | None = None, **asked: Any
 ) -> Sensitivity:
@@ -95,6 +96,12 @@ def sensitivity(
     ------
     UsageError
         If the request does not fit the scenario, there are no links, or too many to list.
+
+    Examples
+    --------
+    >>> import stochfuse as sf
+    >>> sf.sensitivity("thesis-transient", 0.5).derivative[:2].round(4)
+    array([-3.2051, -3.2051])
     """
     network = scenario.network
     if not 1 < network.agents <= MOST_AGENTS:
@@ -143,7 +150,12 @@ def _matrix(scenario: Scenario, link: float | np.ndarray | None, case: str | Non
             raise UsageError(f"sensitivity: expected links to start from, got none here nor in network.link{more}")
     elif case is not None:
         raise UsageError(f"case: expected none beside link probabilities of one's own, got '{case}'")
-    array = np.asarray(chosen, dtype=float)
+    try:
+        array = np.asarray(chosen, dtype=float)
+    except (TypeError, ValueError):
+        raise UsageError(
+            f"link: expected a probability or a {network.agents}×{network.agents} matrix, got {link!r}"
+        ) from None
     if array.ndim not in (0, 2):
         raise UsageError("sensitivity: expected links that do not vary with the step, got links per step")
     n = network.agents
@@ -206,8 +218,8 @@ def _slope(f: np.ndarray, x: float, a: float, length: float, agent: int | str, e
     return float(min(slopes) if least else max(slopes)), float(max(errors))
 
 
-@dataclass(frozen=True, eq=False)
-class ShareOfGain:
+@dataclass(frozen=True, eq=False, repr=False)
+class ShareOfGain(Result):
     """Share of the gain (E(0) − E(µ)) / (E(0) − E(1)), against link probability and step.
 
     Parameters
@@ -228,6 +240,7 @@ class ShareOfGain:
     prediction: Prediction
 
 
+@of_scenario
 def share_of_gain(scenario: Scenario, link: Any = None, **asked: Any) -> ShareOfGain:
     """Return which share of the gain from µ = 0 to µ = 1 is reached at some links.
 
@@ -242,6 +255,12 @@ def share_of_gain(scenario: Scenario, link: Any = None, **asked: Any) -> ShareOf
         If the request does not fit the scenario.
     NoAnswerError
         If there is nothing to gain: E(0) = E(1) throughout.
+
+    Examples
+    --------
+    >>> import stochfuse as sf
+    >>> float(sf.share_of_gain("thesis-transient", [0.5]).share[0, -1].round(3))
+    0.649
     """
     asked_for = question(scenario, **asked)
     prediction, ends = asked_for.predict(link), asked_for.predict([0.0, 1.0])

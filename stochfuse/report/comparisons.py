@@ -17,7 +17,7 @@ from stochfuse import __version__
 from stochfuse.kalman.metrics import Metric
 from stochfuse.prediction.compare import Comparison, EstimatorComparison
 from stochfuse.report import predictions
-from stochfuse.report.plot import COLORS, MARKERS, figure_class, spread
+from stochfuse.report.plot import COLORS, MARKERS, below, figure_class, shades, spread, titled
 from stochfuse.report.predictions import PredictionView
 from stochfuse.report.table import Report, Table, number, to_csv
 
@@ -172,7 +172,6 @@ def compare_json(view: ComparisonView) -> dict[str, Any]:
 
 def draw(view: ComparisonView):
     """Return the figure."""
-    from matplotlib import colormaps
     from matplotlib.lines import Line2D
     from matplotlib.ticker import MaxNLocator
 
@@ -188,7 +187,7 @@ def draw(view: ComparisonView):
         chosen, names = spread(len(p.link)), list(p.cases or [f"mean µ = {µ:.3g}" for µ in p.link])
     figure = figure_class()(figsize=(11, 5.4), layout="constrained")
     left, right = figure.subplots(1, 2)
-    colors = colormaps["viridis"](np.linspace(0, 0.9, len(chosen)))
+    colors = shades(len(chosen))
     styles: list[Any] = ["-", "--", ":", "none"]
     for m in range(len(view.views)):
         errors = view.errors(m)
@@ -225,9 +224,9 @@ def draw(view: ComparisonView):
         for m, q in enumerate(view.comparison.predictions)
     ]
     steps = [Line2D([], [], color=color, linewidth=3, label=names[c]) for c, color in zip(chosen, colors, strict=True)]
-    left.legend(handles=[*methods, *steps], fontsize="small", ncols=2)
+    below(figure, [*methods, *steps])
     bars = "; bars: 95 % confidence" if any(view.errors(m) is not None for m in range(len(view.views))) else ""
-    figure.suptitle("\n".join(wrap(first.what, 100)) + f"\n{first.whom}{bars}", fontsize="medium")
+    titled(figure, first.what, first.whom + bars)
     return figure
 
 
@@ -414,11 +413,10 @@ def draw_estimators(view: EstimatorView):
         for q in view.quantities
         if q != "consistency"
     ]
-    figure.legend(handles=[*names, *kinds], fontsize="small", loc="outside lower center", ncols=4)
+    below(figure, [*names, *kinds])
     where = f"after step {steps[-1]}" if over_rows else p.cases[0] if p.cases else f"µ = {p.link[0]:.3g}"
     title = f"What estimators claim and what is true, {where}; {view.views[0][0].whom}"
-    lines = wrap(title, 45 * len(panels) + 15, break_on_hyphens=False)
-    figure.suptitle("\n".join(lines), fontsize="medium")
+    titled(figure, title)
     return figure
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ import numpy as np
 from stochfuse import __version__
 from stochfuse.kalman.metrics import Metric
 from stochfuse.questions.messages import IDENTITY_BYTES, NUMBER_BYTES, Accuracy, Bytes, MessageLoad, in_bytes
-from stochfuse.report.plot import MARKERS, figure_class, spread
+from stochfuse.report.plot import MARKERS, below, figure_class, spread, titled
 from stochfuse.report.predictions import PredictionView
 from stochfuse.report.table import Report, Table, number, to_csv
 from stochfuse.scenario.registry import LFG, NAIVE
@@ -294,13 +293,8 @@ def draw(view: LoadView):
     {"moments": _draw_moments, "accuracy": _draw_accuracy}.get(view.kind, _draw_distribution)(view, axes)
     axes.set_ylim(bottom=0)
     axes.grid(alpha=0.3)
-    curves = len(axes.get_legend_handles_labels()[1])
-    if curves > MOST_INSIDE:
-        axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
-    else:
-        axes.legend(fontsize="small")
-    figure.suptitle("\n".join(wrap(view.what, 80)), fontsize="medium")
-    axes.set_title("\n".join(line for text in view.titles[1:] for line in wrap(text, 100)), fontsize="small")
+    below(figure)
+    titled(figure, view.what, *view.titles[1:])
     return figure
 
 

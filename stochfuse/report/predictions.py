@@ -6,7 +6,7 @@ Several quantities of one prediction side by side: claimed beside actual, and wh
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from textwrap import wrap
 from typing import Any
 
@@ -15,12 +15,13 @@ import numpy as np
 from stochfuse import __version__
 from stochfuse.engines.distribution import parse_statistic
 from stochfuse.errors import StochfuseError, UsageError
-from stochfuse.kalman.metrics import Metric, metric, power
+from stochfuse.kalman.metrics import Metric, power
+from stochfuse.prediction.predict import predict
 from stochfuse.prediction.quantities import OVERCONFIDENT, expectation, noun, title
 from stochfuse.prediction.quantities import unit as unit_of
 from stochfuse.prediction.result import Prediction
-from stochfuse.report.plot import MARKERS, figure_class, spread
-from stochfuse.report.table import Report, Table, number, to_csv, to_text
+from stochfuse.report.plot import DASHES, MARKERS, below, direct, figure_class, shades, spread, titled
+from stochfuse.report.table import Report, Table, number, to_csv
 from stochfuse.scenario.registry import OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.registry import title as method_title
 
@@ -85,6 +86,8 @@ class PredictionView:
 
     def values(self) -> np.ndarray:
         """Values shown, shape (links, steps)."""
+        if self.prediction.meta.get("faults"):  # items without an answer stay what they are
+            return self._at(self.prediction.values(self.metric, self.agent))
         if self.statistic != "mean":
             return _finite(self._at(self.prediction.statistic(self.statistic, self.metric, self.agent)))
         values = self.prediction.values(self.metric, self.agent)
@@ -219,12 +222,6 @@ def report(views: Sequence[PredictionView]) -> Report:
     if len(views) > 1:
         return Report.of(views, side_table, side_csv, side_json, draw_side)
     return Report.of(views[0], predict_table, predict_csv, predict_json, draw)
-
-
-def text_of(prediction: Prediction, of: str, agent: int | str) -> str:
-    """Return the table of a prediction as text of any width."""
-    view = PredictionView(prediction, metric(of, prediction.scenario.model), agent)
-    return to_text(predict_table(view), width=None)
 
 
 def predict_table(view: PredictionView) -> Table:
@@ -370,47 +367,42 @@ def side_json(views: Sequence[PredictionView]) -> dict[str, Any]:
 
 def draw_side(views: Sequence[PredictionView]):
     """Return the figure, one panel for each unit."""
-    from matplotlib import colormaps
     from matplotlib.lines import Line2D
-    from matplotlib.ticker import MaxNLocator
 
-    p = views[0].prediction
-    against_link = p.cases is None and len(p.link) > 1
-    order = np.argsort(p.link)
-    steps = views[0].steps
-    chosen = spread(len(steps)) if against_link else spread(len(p.link))
-    names = [f"k = {k}" for k in steps] if against_link else list(p.cases or [f"mean µ = {µ:.3g}" for µ in p.link])
+    p, steps = views[0].prediction, views[0].steps
+    over = _over_links(views[0])
+    chosen = spread(len(steps) if over else len(p.link))
+    names = [f"k = {k}" for k in steps] if over else _row_names(p)
     units = list(dict.fromkeys(_axis(view) for view in views))
-    figure = figure_class()(figsize=(1.5 + 5.0 * len(units), 5.2), layout="constrained")
+    figure = figure_class()(figsize=(1.5 + 5.0 * len(units), 5.6), layout="constrained")
     panels = dict(zip(units, figure.subplots(1, len(units), squeeze=False)[0], strict=True))
-    colors = colormaps["viridis"](np.linspace(0, 0.9, len(chosen)))
+    colors = shades(len(chosen))
     for v, view in enumerate(views):
-        axes, values, errors = panels[_axis(view)], view.values(), view.errors()
+        axes = panels[_axis(view)]
         for c, color in zip(chosen, colors, strict=True):
-            x, y = (p.link[order], values[order, c]) if against_link else (steps, values[c])
-            bars = None if errors is None else 1.96 * (errors[order, c] if against_link else errors[c])
-            marker = MARKERS[v] if len(x) <= 30 else None
-            axes.errorbar(x, y, bars, color=color, linestyle=STYLES[v % 4], marker=marker, markersize=4, capsize=2)
+            _curve(axes, view, c, color=color, linestyle=STYLES[v % 4], marker=MARKERS[v])
     for label, axes in panels.items():
-        axes.set_ylabel(label)
-        axes.set_xlabel("link probability µ" if against_link else "step k")
-        if not against_link:
-            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        if label != RATIO and all(view.values().min() >= 0 for view in views if _axis(view) == label):
-            axes.set_ylim(bottom=0)
-        axes.grid(alpha=0.3)
+        shown = [view for view in views if _axis(view) == label]
+        _dress(axes, shown[0], label, zero=label != RATIO and all(view.values().min() >= 0 for view in shown))
     quantities = [
         Line2D(
             [], [], color="0.2", linestyle=STYLES[v % 4], marker=MARKERS[v], markersize=4, label=w.prediction.quantity
         )
         for v, w in enumerate(views)
     ]
-    curves = [Line2D([], [], color=color, linewidth=3, label=names[c]) for c, color in zip(chosen, colors, strict=True)]
-    panels[units[0]].legend(handles=[*quantities, *curves], fontsize="small", ncols=2)
-    sampled = "; bars: 95 % confidence" if p.sampled is not None else ""
-    how = [line for view in dict.fromkeys(v.how for v in views) for line in wrap(view + sampled, 50 * len(units) + 30)]
-    what = f"expected {p.stage} covariances and errors"
-    figure.suptitle("\n".join([f"{views[0].whom}; {what}", *how]), fontsize="medium")
+    below(
+        figure,
+        [
+            *quantities,
+            *(
+                Line2D([], [], color=color, linewidth=3, label=names[c])
+                for c, color in zip(chosen, colors, strict=True)
+            ),
+        ],
+    )
+    sampled = "; bands: 95 % confidence" if p.sampled is not None else ""
+    how = dict.fromkeys(f"{view.how}{sampled}" for view in views)
+    titled(figure, f"{views[0].whom}; expected {p.stage} covariances and errors", *how)
     return figure
 
 
@@ -420,52 +412,89 @@ def _axis(view: PredictionView) -> str:
 
 def draw(view: PredictionView):
     """Return the figure, not shown and not registered with pyplot."""
-    Figure = figure_class()
-    from matplotlib.ticker import MaxNLocator
-
-    p, values = view.prediction, view.values()
-    order = np.argsort(p.link)
-    figure = Figure(figsize=(7.5, 5.0), layout="constrained")
-    axes = figure.add_subplot()
-    if p.cases is None and len(p.link) > 1:
-        chosen = spread(len(view.steps))
-        curves = [(f"k = {view.steps[i]}", p.link[order], values[order, i]) for i in chosen]
-        axes.set_xlabel("link probability µ")
-        legend = "step" if len(chosen) == len(view.steps) else f"step ({len(chosen)} of {len(view.steps)})"
-    else:
-        chosen = spread(len(p.link))
-        names = p.cases or [f"mean µ = {µ:.3g}" for µ in p.link]
-        curves = [(names[i], view.steps, values[i]) for i in chosen]
-        axes.set_xlabel("step k")
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        legend = "links" if len(chosen) == len(p.link) else f"links ({len(chosen)} of {len(p.link)})"
-    errors = view.errors()
-    bars: list[Any] = [None] * len(curves)
-    if errors is not None:
-        against_link = p.cases is None and len(p.link) > 1
-        bars = [1.96 * (errors[order, i] if against_link else errors[i]) for i in chosen]
-    _draw_curves(axes, curves, bars)
-    if view.statistic == "mean":
-        axes.set_ylabel(view.axis)
-    else:
-        axes.set_ylabel("\n".join(wrap(view.what.partition(": ")[2].partition(" [no unit")[0], 45)))
-    if values.min() >= 0:
-        axes.set_ylim(bottom=0)
-    axes.grid(alpha=0.3)
-    axes.legend(title=legend, fontsize="small")
-    figure.suptitle("\n".join(wrap(view.what, 80)), fontsize="medium")
-    axes.set_title(
-        "\n".join([view.whom, *wrap(view.how + ("; bars: 95 % confidence" if errors is not None else ""), 100)]),
-        fontsize="small",
-    )
+    figure = figure_class()(figsize=(7.5, 5.0), layout="constrained")
+    draw_on(figure.add_subplot(), view)
+    bars = "; bands: 95 % confidence" if view.prediction.sampled is not None else ""
+    titled(figure, view.what, view.whom, view.how + bars)
     return figure
 
 
-def _draw_curves(axes, curves: list[tuple[str, np.ndarray, np.ndarray]], bars: list[Any]) -> None:
-    from matplotlib import colormaps
+def draw_on(axes: Any, view: PredictionView) -> None:
+    """Draw the values on some axes: against link probability, a curve a step, or against the step, a curve a row."""
+    p = view.prediction
+    over = _over_links(view)
+    chosen = spread(len(view.steps) if over else len(p.link))
+    names = [f"k = {k}" for k in view.steps] if over else _row_names(p)
+    fine = _smooth(view) if over else None
+    lines = [
+        _curve(axes, view, c, color=color, linestyle=DASHES[i], marker=MARKERS[i], fine=fine)
+        for i, (c, color) in enumerate(zip(chosen, shades(len(chosen)), strict=True))
+    ]
+    if view.statistic == "mean":
+        label = view.axis
+    else:
+        label = "\n".join(wrap(view.what.partition(": ")[2].partition(" [no unit")[0], 45))
+    _dress(axes, view, label, zero=view.values().min() >= 0)
+    whole, what = (len(view.steps), "steps") if over else (len(p.link), "rows")
+    direct(
+        axes, lines, [names[c] for c in chosen], None if len(chosen) == whole else f"{len(chosen)} of {whole} {what}"
+    )
 
-    colors = colormaps["viridis"](np.linspace(0, 0.9, len(curves)))
-    for i, (label, x, y) in enumerate(curves):
-        few = len(x) <= 30
-        marker = MARKERS[i % len(MARKERS)] if few else None
-        axes.errorbar(x, y, bars[i], color=colors[i], label=label, marker=marker, markersize=4, capsize=2)
+
+def _over_links(view: PredictionView) -> bool:
+    """Whether curves run over link probabilities: a step each; else over the steps, a row each."""
+    return view.prediction.cases is None and len(view.prediction.link) > 1
+
+
+def _row_names(p: Prediction) -> list[str]:
+    return list(p.cases or [f"{'µ' if _uniform(p) else 'mean µ'} = {µ:.3g}" for µ in p.link])
+
+
+def _curve(
+    axes: Any, view: PredictionView, c: int, *, fine: PredictionView | None = None, marker: str, **style: Any
+) -> Any:
+    """Draw one step over the link probabilities, or one row over the steps: a line, the asked points, a band."""
+    p, values, errors = view.prediction, view.values(), view.errors()
+    over, order = _over_links(view), np.argsort(p.link)
+    x, y = (p.link[order], values[order, c]) if over else (view.steps, values[c])
+    few = len(x) <= 30
+    if fine is None:
+        (line,) = axes.plot(x, y, marker=marker if few else None, markersize=4, **style)
+    else:
+        (line,) = axes.plot(fine.prediction.link, fine.values()[:, c], **style)
+        axes.plot(x, y, linestyle="none", marker=marker if few else None, markersize=4, color=style["color"])
+    if errors is not None:
+        reach = WIDTH_95 * (errors[order, c] if over else errors[c])
+        axes.fill_between(x, y - reach, y + reach, color=style["color"], alpha=0.2, linewidth=0)
+    return line
+
+
+def _dress(axes: Any, view: PredictionView, label: str, *, zero: bool) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    axes.set_ylabel(label)
+    axes.set_xlabel("link probability µ" if _over_links(view) else "step k")
+    if not _over_links(view):
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    if zero:
+        axes.set_ylim(bottom=0)
+    axes.grid(alpha=0.3)
+
+
+SMOOTH = 101
+"""Link probabilities of a smooth curve."""
+
+
+def _smooth(view: PredictionView) -> PredictionView | None:
+    """The same at many link probabilities, where that is cheap; None where it is not, or rows are not one µ each."""
+    p = view.prediction
+    cheap = p.method == SIMPLIFIED or (p.outcomes is not None and p.outcomes.polynomial)
+    if not cheap or not _uniform(p) or view.baseline is not None or len(p.link) >= SMOOTH:
+        return None
+    link = np.union1d(p.link, np.linspace(p.link.min(), p.link.max(), SMOOTH))
+    asked: dict[str, Any] = {} if p.method == SIMPLIFIED else {"estimator": p.estimator}
+    again = predict(p.scenario, link, p.method, p.quantity, **asked)
+    fine = replace(view, prediction=again)
+    # rows that were whole matrices are shown by their means, which say less
+    same = np.allclose(fine.values()[np.searchsorted(link, p.link)], view.values(), rtol=1e-9)
+    return fine if same else None

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from stochfuse import __version__
-from stochfuse.report.plot import MARKERS, figure_class
+from stochfuse.report.plot import DASHES, MARKERS, figure_class, shades, titled
 from stochfuse.report.table import Report, Table, number, to_csv
 
 SCHEMA = "stochfuse.reproduction/1"
@@ -269,24 +269,30 @@ def draw(sheet: Sheet):
     n = max(1, len(sheet.panels))
     columns = min(n, 2)
     figure = figure_class()(figsize=(6.2 * columns + 0.6, 4.6 * -(-n // columns) + 0.6), layout="constrained")
-    figure.suptitle("\n".join(wrap(f"Thesis {name_of(sheet.key)}: {sheet.title}", 55 * columns)), fontsize="medium")
+    titled(figure, f"Thesis {name_of(sheet.key)}: {sheet.title}")
     for i, panel in enumerate(sheet.panels, start=1):
         _draw_panel(figure.add_subplot(-(-n // columns), columns, i), panel)
     return figure
 
 
 def _draw_panel(axes, panel: Panel) -> None:
-    from matplotlib import colormaps
-
     own = any(curve.at is not None for curve in panel.curves)
-    colors = colormaps["viridis"](np.linspace(0, 0.9, len(panel.curves)))
+    colors = shades(len(panel.curves))
     width = 0.8 / len(panel.curves)
     for i, (curve, color) in enumerate(zip(panel.curves, colors, strict=True)):
         x = panel.x if curve.at is None else curve.at
         if panel.bars:
             axes.bar(x + (i - (len(panel.curves) - 1) / 2) * width, curve.y, width, color=color, label=curve.name)
             continue
-        axes.plot(x, curve.y, color=color, marker=MARKERS[i % len(MARKERS)], markersize=4, label=curve.name)
+        axes.plot(
+            x,
+            curve.y,
+            linestyle=DASHES[i % len(DASHES)],
+            color=color,
+            marker=MARKERS[i % len(MARKERS)],
+            markersize=4,
+            label=curve.name,
+        )
         if curve.low is not None and curve.high is not None:
             axes.fill_between(x, curve.low, curve.high, color=color, alpha=0.15, linewidth=0)
     if not own:
@@ -297,4 +303,5 @@ def _draw_panel(axes, panel: Panel) -> None:
         axes.set_ylim(*panel.y_range)
     axes.set_title("\n".join(wrap(panel.title, 60)), fontsize="small")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize="x-small")
+    few = len(panel.curves) <= 4 or len(panel.points) > 6
+    axes.legend(fontsize="x-small", loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2 if few else 3)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from stochfuse.questions.agents_needed import AgentsNeeded
 from stochfuse.questions.least_link import BESIDE, LeastLink
 from stochfuse.questions.question import Question, described, named
 from stochfuse.questions.sensitivity import Sensitivity, ShareOfGain
-from stochfuse.report.plot import MARKERS, figure_class, spread
+from stochfuse.report.plot import MARKERS, below, figure_class, spread, titled
 from stochfuse.report.predictions import PredictionView
 from stochfuse.report.table import Report, Table, number, to_csv
 
@@ -363,9 +362,8 @@ def draw(sheet: SolutionSheet, found: Any) -> Any:
         "steady": _draw_steady,
     }
     drawn[sheet.kind](axes, sheet, found)
-    figure.suptitle("\n".join(wrap(sheet.answer[0], 80)), fontsize="medium")
-    about = sheet.titles[len(sheet.answer) :]
-    axes.set_title("\n".join(line for text in about for line in wrap(text, 100)), fontsize="small")
+    below(figure)
+    titled(figure, sheet.answer[0], *sheet.titles[len(sheet.answer) :])
     return figure
 
 
@@ -383,7 +381,6 @@ def _draw_least_link(axes: Any, sheet: SolutionSheet, found: LeastLink) -> None:
     axes.plot([found.link], [found.value], "o", color="C3", label=f"least µ = {found.link:.6g}")
     axes.axvline(found.link, color="C3", linestyle=":", linewidth=1)
     _finish(axes, "link probability µ", _label(sheet))
-    axes.legend(fontsize="small")
 
 
 def _draw_agents(axes: Any, sheet: SolutionSheet, found: AgentsNeeded) -> None:
@@ -394,7 +391,6 @@ def _draw_agents(axes: Any, sheet: SolutionSheet, found: AgentsNeeded) -> None:
         axes.set_xscale("log")
         axes.set_yscale("log")
     _finish(axes, "agents", _label(sheet))
-    axes.legend(fontsize="small")
 
 
 def _draw_sensitivity(axes: Any, sheet: SolutionSheet, found: Sensitivity) -> None:
@@ -402,9 +398,10 @@ def _draw_sensitivity(axes: Any, sheet: SolutionSheet, found: Sensitivity) -> No
     if len(found.links) <= MOST_BARS:
         order = found.order[::-1]
         names = [f"{found.links[i][0]} to {receivers(found, int(i))}" for i in order]
-        axes.barh(names, found.derivative[order], color=["C3" if int(i) in found.first else "C0" for i in order])
+        first = ["//" if int(i) in found.first else "" for i in order]
+        axes.barh(names, found.derivative[order], color=["C3" if f else "C0" for f in first], hatch=first)
         axes.axvline(0, color="0.3", linewidth=0.8)
-        _finish(axes, label + "; red: improve first", "link")
+        _finish(axes, label + "; hatched: improve first", "link")
         return
     n = found.question.scenario.network.agents
     grid = np.full((n, n), np.nan)
@@ -431,7 +428,6 @@ def _draw_gain(axes: Any, sheet: SolutionSheet, found: ShareOfGain) -> None:
         for i, row in enumerate(spread(len(p.cases))):
             axes.plot(names, 100 * found.share[row], marker=MARKERS[i], markersize=4, label=p.cases[row])
         _finish(axes, "step", "share of the gain [%]")
-    axes.legend(fontsize="small")
 
 
 def _draw_steady(axes: Any, sheet: SolutionSheet, found: Any) -> None:

@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -270,6 +271,18 @@ def render(table: Table | Sequence[Table], format: str, width: int) -> str:
     if format == "markdown":
         return to_markdown(table)
     return to_latex(table) if format == "latex" else to_text(table, width)
+
+
+def to_html(table: Table | Sequence[Table]) -> str:
+    """Return an HTML table under its title, as notebooks show it."""
+    if not isinstance(table, Table):
+        return "".join(map(to_html, table))
+    line = lambda kind, cells: "<tr>" + "".join(f"<{kind}>{escape(cell)}</{kind}>" for cell in cells) + "</tr>"  # noqa: E731
+    title = "".join(f"<div>{escape(text)}</div>" for text in table.title)
+    shown, left_out = _shortened(table)
+    body = "".join(line("td", row) for row in shown.rows)
+    more = f"<div>… {left_out:,} rows in the middle are left out</div>" if left_out else ""
+    return f"<div>{title}<table><thead>{line('th', table.headings)}</thead><tbody>{body}</tbody></table>{more}</div>"
 
 
 SUFFIXES = {".csv": "csv", ".json": "json", ".md": "markdown", ".tex": "latex", ".txt": "table"}

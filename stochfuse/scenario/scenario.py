@@ -17,11 +17,11 @@ import copy
 import json
 import sys
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -42,7 +42,7 @@ CORRELATIONS = ("independent", "shared")
 _PRESETS = Path(__file__).parent / "presets"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Scenario:
     """A checked scenario; make one with `load_scenario` or `Scenario.from_mapping`.
 
@@ -89,6 +89,14 @@ class Scenario:
     estimator: str | None = None
     runs: int | None = None
 
+    def __repr__(self) -> str:
+        """One line."""
+        network, states = self.network, ", ".join(self.model.states[:8])
+        return (
+            f"Scenario({self.name}: {network.agents} agents, {network.architecture}, {network.steps} steps, state "
+            f"({states}{', …' if len(self.model.states) > 8 else ''}))"
+        )
+
     @cached_property
     def system(self) -> System:
         """The scenario as engines see it; see `stochfuse.scenario.system`."""
@@ -105,6 +113,7 @@ class Scenario:
         """
         from stochfuse.scenario.schema import structure_problems
 
+        mapping = _plain(mapping)
         return _build(mapping, name, structure_problems(mapping))
 
     def until(self, step: int) -> Scenario:
@@ -153,12 +162,13 @@ def preset_names() -> list[str]:
     return sorted(path.stem for path in _PRESETS.glob("*.toml"))
 
 
-def load_scenario(source: str | Path = DEFAULT, **overrides: Any) -> Scenario:
+def load_scenario(source: str | Path | Mapping[str, Any] = DEFAULT, **overrides: Any) -> Scenario:
     """Read a scenario.
 
     Parameters
     ----------
-    source : a preset's name, a TOML or JSON file's path, or "-" for standard input.
+    source : a preset's name, a TOML or JSON file's path, "-" for standard input, or a mapping with a file's keys, whose
+        lists and numbers may be NumPy's.
     **overrides : agents, steps, architecture, q, r, p0: numbers that take the place of network.agents, network.steps,
         network.architecture, model.Q, model.R and initial.P; `uniform_link=True` drops the file's link and cases, for a
         caller who gives the link probability.  For a state of several dimensions a number is that multiple of the
@@ -168,13 +178,55 @@ def load_scenario(source: str | Path = DEFAULT, **overrides: Any) -> Scenario:
     ------
     ScenarioError
         If the file is missing or malformed, or naming every offending key.
+
+    Examples
+    --------
+    >>> import stochfuse as sf
+    >>> sf.load_scenario("thesis-transient", agents=5).network.agents
+    5
+    >>> sf.load_scenario({"model": {"F": 1, "H": 1, "Q": 1, "R": 4}, "initial": {"P": 10},
+    ...                   "network": {"agents": 2, "steps": 3}}).model.dimension
+    1
     """
+    if isinstance(source, Mapping):
+        return Scenario.from_mapping(_override(_plain(source), overrides))
+    if not isinstance(source, str | Path):
+        raise UsageError(
+            f"scenario: expected a preset's name, a path, or a mapping with a file's keys, got {type(source).__name__}"
+        )
     name, text = read_text(source)
     mapping = _override(parse(name, text), overrides)
     if is_preset(source):
         # the presets' structure is checked by the tests; pydantic would double the time of a plain `predict`
         return _build(mapping, name, [])
     return Scenario.from_mapping(mapping, name)
+
+
+def _plain(value: Any) -> Any:
+    """A value as a file would have it: lists for arrays and tuples, Python's numbers for NumPy's."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    return [_plain(entry) for entry in value] if isinstance(value, list | tuple) else value
+
+
+ScenarioLike = Scenario | str | Path | Mapping[str, Any]
+"""What may stand for a scenario: one, a preset's name, a path, or a mapping with a file's keys."""
+P = ParamSpec("P")
+Answer = TypeVar("Answer")
+
+
+def of_scenario(
+    question: Callable[Concatenate[Scenario, P], Answer],
+) -> Callable[Concatenate[ScenarioLike, P], Answer]:
+    """Let a function of a scenario take whatever may stand for one."""
+
+    @wraps(question)
+    def asked(scenario: ScenarioLike, *args: P.args, **kwargs: P.kwargs) -> Answer:
+        return question(scenario if isinstance(scenario, Scenario) else load_scenario(scenario), *args, **kwargs)
+
+    return asked
 
 
 def link_rows(scenario: Scenario, link: Any = None) -> LinkRows:
@@ -289,7 +341,8 @@ def _override(mapping: dict[str, Any], overrides: Mapping[str, Any]) -> dict[str
         if value is None or key == "uniform_link":
             continue
         if key not in places:
-            raise TypeError(f"load_scenario() got an unexpected keyword argument '{key}'")
+            near = nearest(key, places)
+            raise TypeError(f"load_scenario() got an unexpected keyword argument '{key}'{near}")
         table, entry = places[key]
         if isinstance(mapping.setdefault(table, {}), dict):
             mapping[table][entry] = value

@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from stochfuse.errors import UsageError
+from stochfuse.prediction.result import Result
 from stochfuse.studies.evaluation import Answers
 from stochfuse.studies.plan import Plan
 
@@ -34,8 +35,8 @@ LINES = 100_000
 """Lines of a CSV file that are held at a time."""
 
 
-@dataclass(frozen=True, eq=False)
-class Results:
+@dataclass(frozen=True, eq=False, repr=False)
+class Results(Result):
     """A finished study.
 
     Parameters

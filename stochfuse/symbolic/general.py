@@ -225,6 +225,12 @@ def derive_general(
     ------
     UsageError
         If a number is out of range.
+
+    Examples
+    --------
+    >>> import stochfuse as sf
+    >>> sf.derive_general(agents=2, step=2, q=25, r=100, p0=100).closed()
+    -20*mu**3/9 + 120*mu**2/7 - 850*mu/21 + 500/9
     """
     for name, value in (("agents", agents), ("step", step)):
         if value < 1:

@@ -88,7 +88,14 @@ def derive_optimal(
     architecture: str = "ad-hoc",
     correlation: str = "independent",
 ) -> OptimalForm:
-    """Return the expected optimum as formulas; parameters and errors are those of `derive_general`."""
+    """Return the expected optimum as formulas; parameters and errors are those of `derive_general`.
+
+    Examples
+    --------
+    >>> import stochfuse as sf
+    >>> sf.derive_optimal(agents=2, step=2, q=25, r=100, p0=100).closed()
+    800*mu**2/63 - 2410*mu/63 + 500/9
+    """
     form = derive_general(agents, step, q, r, p0, architecture=architecture, correlation=correlation, estimator=OPTIMAL)
     return OptimalForm(**{field.name: getattr(form, field.name) for field in fields(form)})
 

@@ -279,6 +279,12 @@ def derive_simplified(
     ------
     UsageError
         If a number is out of range.
+
+    Examples
+    --------
+    >>> import stochfuse as sf
+    >>> sf.derive_simplified(agents=3, step=1).closed()
+    mu**2*p0/3 - mu*p0 + p0
     """
     for name, value in (("agents", agents), ("step", step)):
         if not 1 <= value <= MOST_AGENTS_OR_STEPS:

@@ -532,7 +532,7 @@ GOOD = Signal(np.zeros((2, 1)), A, B)
         ([GOOD, GOOD._replace(a=None)], r"signals\[2\]\.a: expected a mean in every signal or in none, got none"),
         ([GOOD._replace(a=None), GOOD], r"signals\[2\]\.a: expected a mean in every signal or in none, got one"),
         (
-            [GOOD, GOOD._replace(a=np.zeros(2))],
+            [GOOD, GOOD._replace(a=np.zeros(3))],
             r"signals\[2\]\.a: expected a finite column of shape \(2, 1\), got shape",
         ),
         (

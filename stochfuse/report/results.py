@@ -1,0 +1,152 @@
+"""Results of the Python interface in every form: which report shows what kind of result."""
+
+from __future__ import annotations
+
+import io
+from importlib import import_module
+from typing import Any
+
+from stochfuse.errors import StochfuseError, UsageError
+from stochfuse.kalman.metrics import metric
+from stochfuse.prediction.compare import Comparison, EstimatorComparison
+from stochfuse.prediction.result import Prediction
+from stochfuse.questions.agents_needed import AgentsNeeded
+from stochfuse.questions.least_link import LeastLink
+from stochfuse.questions.messages import MessageLoad
+from stochfuse.questions.sensitivity import Sensitivity, ShareOfGain
+from stochfuse.report import comparisons, messages, predictions, solutions, study_figures
+from stochfuse.report.plot import figure_class
+from stochfuse.report.predictions import PredictionView
+from stochfuse.report.table import Report, to_html, to_text
+from stochfuse.studies.files import Results
+
+SHEETS = {
+    AgentsNeeded: solutions.agents_sheet,
+    LeastLink: solutions.least_link_sheet,
+    Sensitivity: solutions.sensitivity_sheet,
+    ShareOfGain: solutions.gain_sheet,
+}
+
+
+def report_of(result: Any, of: str | None = None, agent: int | str = "mean") -> Report:
+    """Return a result in every form.
+
+    Parameters
+    ----------
+    of : metric of the covariance; default: the scenario's, else trace.
+    agent : "mean", "worst", "best" or a number from 1.
+    """
+    sheet = SHEETS.get(type(result))
+    if sheet is not None:
+        return solutions.solution_report(sheet(result), result)
+    if isinstance(result, MessageLoad):
+        return messages.load_report(messages.LoadView((result,), result))
+    if isinstance(result, Results):
+        return study_figures.summary_report(result, 5)
+    scenario = (result if isinstance(result, Prediction) else result.predictions[0]).scenario
+    chosen = metric(of or scenario.metric or "trace", scenario.model)
+    if isinstance(result, EstimatorComparison):
+        return comparisons.estimator_report(comparisons.EstimatorView(result, chosen, agent))
+    if isinstance(result, Comparison):
+        views = tuple(PredictionView(p, chosen, agent) for p in result.predictions)
+        return comparisons.comparison_report(comparisons.ComparisonView(result, views))
+    return predictions.report([_view(result, of, agent)])
+
+
+def text_of(result: Any, **shown: Any) -> str:
+    """Return a result's table as text of any width."""
+    return to_text(report_of(result, **shown).table(), width=None)  # type: ignore[arg-type]
+
+
+def html_of(result: Any) -> str:
+    """Return a result's table as HTML."""
+    return to_html(report_of(result).table())
+
+
+def figure_of(result: Any, ax: Any = None, **shown: Any) -> Any:
+    """Return a result's figure, or draw a prediction on axes that are given, and return their figure.
+
+    Raises
+    ------
+    StochfuseError
+        If matplotlib is not installed.
+    UsageError
+        If axes are given for something that needs axes of its own.
+    """
+    figure_class()
+    if ax is None:
+        drawing = report_of(result, **shown).draw
+        if drawing is None:
+            raise UsageError(f"plot: there is no figure of a {type(result).__name__}")
+        return drawing()
+    if not isinstance(result, Prediction):
+        raise UsageError(f"ax: expected none, a {type(result).__name__} needs axes of its own")
+    predictions.draw_on(ax, _view(result, **shown))
+    return ax.figure
+
+
+def _view(p: Prediction, of: str | None = None, agent: int | str = "mean") -> PredictionView:
+    return PredictionView(p, metric(of or p.scenario.metric or "trace", p.scenario.model), agent)
+
+
+def frame_of(result: Any, **shown: Any) -> Any:
+    """Return a result's records as a tidy pandas DataFrame, a number a row, with everything that says what it is."""
+    pandas = installed("pandas")
+    if isinstance(result, Results):
+        return pandas.read_parquet(result.path) if result.path.suffix == ".parquet" else pandas.read_csv(result.path)
+    frame = pandas.read_csv(io.StringIO(report_of(result, **shown).csv()))
+    if isinstance(result, Prediction) and "faults" in result.meta:
+        frame.insert(0, "item", [item for item in range(len(result.link)) for _ in result.steps])
+    return frame
+
+
+def arrays_of(result: Any) -> Any:
+    """Return covariances as an xarray.DataArray with named axes, of several predictions one along a further axis.
+
+    Axes are link (or case), step, agent, row and column; of a bias there is no column.
+    """
+    xarray = installed("xarray")
+    if isinstance(result, Prediction):
+        return _array(xarray, result)
+    if isinstance(result, Comparison | EstimatorComparison):
+        axis = "method" if isinstance(result, Comparison) else "estimator"
+        names = result.methods if isinstance(result, Comparison) else result.estimators
+        arrays = [_array(xarray, p) for p in result.predictions]
+        return xarray.concat(arrays, installed("pandas").Index(names, name=axis), combine_attrs="drop_conflicts")
+    return frame_of(result).to_xarray()
+
+
+def _array(xarray: Any, p: Prediction) -> Any:
+    values, states = p.by_group[:, :, p.group_of], list(p.scenario.model.states)
+    first = ("link", p.link) if p.cases is None else ("case", list(p.cases))
+    axes = [first, ("step", p.steps), ("agent", range(1, len(p.group_of) + 1)), ("row", states), ("column", states)]
+    if p.quantity == "bias":
+        values, axes = values[..., 0], axes[:-1]
+    coords: dict[str, Any] = {name: list(labels) for name, labels in axes}
+    if p.cases is not None:
+        coords["link"] = ("case", p.link)
+    attrs = {
+        "quantity": p.quantity,
+        "method": p.method,
+        "estimator": p.estimator,
+        "nature": p.nature,
+        "stage": p.stage,
+        "scenario": p.scenario.name,
+        "units": ", ".join(unit or "1" for unit in p.scenario.model.units),
+        "states": ", ".join(states),
+    }
+    return xarray.DataArray(values, coords, [name for name, _ in axes], name=f"{p.quantity}_covariance", attrs=attrs)
+
+
+def installed(name: str) -> Any:
+    """Return a module of the extra `data`.
+
+    Raises
+    ------
+    StochfuseError
+        If it is not installed; with the line that installs it.
+    """
+    try:
+        return import_module(name)
+    except ImportError:
+        raise StochfuseError(f"this needs {name}: pip install 'stochfuse[data]'") from None
