@@ -1,7 +1,7 @@
 """Sensors heard over lossy links, fused into one equivalent measurement, then filtered once (theory section 9).
 
 What agents send is what they measured.  At every step an agent makes one measurement of its own and those that it
-hears, z̄ = A z with the bound R̄ (`stochfuse.fusion.equivalent_measurement`), and takes it into its own filter.  At step
+hears, z̄ = A z with the bound R̄ (`stochfuse.fusion.equivalent`), and takes it into its own filter.  At step
 1 nothing has been measured, so that nothing is exchanged.  `IndependentMeasurements` does the same with R̄ as if all
 noises were independent and undisturbed.
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from stochfuse.errors import UsageError
 from stochfuse.estimators.recursion import FusionStep, RecursiveEstimator, Worked
-from stochfuse.fusion.equivalent_measurement import (
+from stochfuse.fusion.equivalent import (
     Equivalent,
     actual_error,
     equivalent_measurement,

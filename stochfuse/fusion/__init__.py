@@ -2,7 +2,7 @@
 
     intersection, intersection_weights   (split) covariance intersection, and the weights that it needs
     blender, parallel                     filters side by side, joined with known cross-covariance
-    equivalent_measurement                correlated and uncertain noises, fused before one filter
+    equivalent                            correlated and uncertain noises, fused before one filter
     cooperative                           what two nodes measure of each other: LWIN and ITNS
     extended, inertial, trajectory        filters and error models of navigation
 
@@ -28,8 +28,8 @@ _HOME = {
     "ParallelFilter": "parallel",
     "parallel_filters": "parallel",
     "cross_covariance": "parallel",
-    "equivalent_measurement": "equivalent_measurement",
-    "independent_measurement": "equivalent_measurement",
+    "equivalent_measurement": "equivalent",
+    "independent_measurement": "equivalent",
     "relation": "cooperative",
     "lwin_update": "cooperative",
     "itns_update": "cooperative",

@@ -127,7 +127,8 @@ def split_covariance_intersection(
     stack, independent = _fuse(A1, A2, [s.H for s in checked], criterion, given)
     terms = [K[0] @ s.a for K, s in zip(stack.gains, checked, strict=True) if s.a is not None]
     c, C = (np.sum(terms, axis=0) if terms else None), stack.C[0]
-    if c is not None and np.ndim(signals[0][0]) == 1:
+    first = signals[0][0]
+    if c is not None and first is not None and np.ndim(first) == 1:
         c = c[:, 0]  # as the means came
     split = (NUMPY.symmetric(C - independent[0]), independent[0]) if len(checked) == 2 else (None, None)
     return Fused(c, C, *split, stack.weights[0], float(stack.certificate[0]))

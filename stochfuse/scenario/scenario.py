@@ -113,7 +113,7 @@ class Scenario:
         """
         from stochfuse.scenario.schema import structure_problems
 
-        mapping = _plain(mapping)
+        mapping = as_file(mapping, name)
         return _build(mapping, name, structure_problems(mapping))
 
     def until(self, step: int) -> Scenario:
@@ -189,7 +189,7 @@ def load_scenario(source: str | Path | Mapping[str, Any] = DEFAULT, **overrides:
     1
     """
     if isinstance(source, Mapping):
-        return Scenario.from_mapping(_override(_plain(source), overrides))
+        return Scenario.from_mapping(_override(as_file(source, "scenario"), overrides))
     if not isinstance(source, str | Path):
         raise UsageError(
             f"scenario: expected a preset's name, a path, or a mapping with a file's keys, got {type(source).__name__}"
@@ -202,8 +202,21 @@ def load_scenario(source: str | Path | Mapping[str, Any] = DEFAULT, **overrides:
     return Scenario.from_mapping(mapping, name)
 
 
+def as_file(mapping: Any, name: str) -> Any:
+    """A mapping as a file would have it: lists for arrays and tuples, Python's numbers for NumPy's.
+
+    Raises
+    ------
+    ScenarioError
+        If it is nested too deeply.
+    """
+    try:
+        return _plain(mapping)
+    except RecursionError:
+        raise ScenarioError(name, "nested too deeply") from None
+
+
 def _plain(value: Any) -> Any:
-    """A value as a file would have it: lists for arrays and tuples, Python's numbers for NumPy's."""
     if isinstance(value, Mapping):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, np.ndarray | np.generic):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from stochfuse.errors import NoAnswerError, UsageError
-from stochfuse.fusion.equivalent_measurement import (
+from stochfuse.fusion.equivalent import (
     actual_error,
     equivalent_measurement,
     independent_measurement,
