@@ -1,4 +1,4 @@
-"""The contact chain itself: whose measurements an agent holds, walked backwards (theory section 6).
+"""The contact chain itself: whose measurements an agent holds, walked backwards.
 
 Agent i at step k holds the measurements of its pedigree.  Walk backwards from (i, k): the set S of agents whose
 step-t data i holds grows at every step by those that one of S heard there.  With equal links and like agents only the
@@ -20,7 +20,7 @@ time; a stationary chain of two states looks the same backwards, so what is know
 failed: the age of i.  The link succeeds with the probability of a delivery after so many failures in a row.  With
 delays as well, a failure at age a is a message that was lost or came later than a steps.
 
-The contact chain: the exact expected optimum, in a handful of terms (theory section 6).
+The contact chain: the exact expected optimum, in a handful of terms.
 
 If fusion lost nothing, an agent's covariance would be that of one filter with everything it holds,
 

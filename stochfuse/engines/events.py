@@ -7,7 +7,7 @@ sender, at once or after a delay that is drawn with it.  Sets of agents are mask
 Bookkeeping of how likely outcomes are, while they are gone through.
 
 With equal µ everywhere, an outcome with c successes of L events has probability µ^c (1−µ)^(L−c): the `CountWeights` and
-`Coefficients` weights keep the factor of every c apart (theory section 5), so that one enumeration answers every µ.
+`Coefficients` weights keep the factor of every c apart ((48)/(49)), so that one enumeration answers every µ.
 `Rows` keeps one probability per row of link probabilities instead, and `Bursty` one for every row and every way in
 which the links can be good and bad.
 """

@@ -1,4 +1,4 @@
-"""Blended parallel filters under lossy links (theory section 9; appendix A of a paper on parallel filters).
+"""Blended parallel filters under lossy links (appendix A of a paper on parallel filters).
 
 Every agent runs a filter of its own that nothing feeds back into, so that the joint covariance of all filters is known
 beforehand, whatever arrives (`stochfuse.fusion.parallel`).  An agent blends its own output with the

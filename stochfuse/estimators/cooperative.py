@@ -1,4 +1,4 @@
-"""Cooperative estimators under lossy links: LWIN and ITNS (theory section 9; a patent's two approaches).
+"""Cooperative estimators under lossy links: LWIN and ITNS (a patent's two approaches).
 
 LWIN (local, with immediate neighbours): agent i takes what it measured of each neighbour into its own estimate, with
 the neighbour's claimed covariance as noise.  ITNS (integrated total network solution): a centre keeps one covariance

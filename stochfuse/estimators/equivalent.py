@@ -1,4 +1,4 @@
-"""Sensors heard over lossy links, fused into one equivalent measurement, then filtered once (theory section 9).
+"""Sensors heard over lossy links, fused into one equivalent measurement, then filtered once.
 
 What agents send is what they measured.  At every step an agent makes one measurement of its own and those that it
 hears, z̄ = A z with the bound R̄ (`stochfuse.fusion.equivalent`), and takes it into its own filter.  At step

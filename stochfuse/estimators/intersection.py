@@ -1,4 +1,4 @@
-"""Split covariance intersection, and covariance intersection, as rules of a fusion network (theory section 9).
+"""Split covariance intersection, and covariance intersection, as rules of a fusion network.
 
 What an agent's own measurement brought in this step, K R Kᵀ, is its independent part; all else, prior and process
 noise, may be correlated with anything.  So at step 1, where nothing has been measured, an estimate has no independent

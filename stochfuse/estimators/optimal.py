@@ -1,4 +1,4 @@
-"""The best that any linear fusion could do with what arrived, theory section 6: no node's measurement is lost.
+"""The best that any linear fusion could do with what arrived: no node's measurement is lost.
 
 An agent holds the measurements of all nodes in its pedigree, so for every step t a set r_t of agents.  What it would
 claim is one filter over all of them,

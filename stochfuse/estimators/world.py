@@ -20,8 +20,8 @@ The error of every linear estimate obeys the estimate's own equations in a world
     prediction   e⁻ = F e − L_Q ε       Q = L_Q L_Qᵀ           (the same ε for all agents)
     measurement  z = C ε                R = C Cᵀ
 
-with independent ε of unit variance.  So the noise footprint of theory section 7, the coefficients of every ε in the
-error, is carried along by the recursion that carries state estimates, with one column for each ε and a last one for b:
+with independent ε of unit variance.  So the noise footprint, the coefficients of every ε in the error, is carried along
+by the recursion that carries state estimates, with one column for each ε and a last one for b:
 
     actual covariance = X Xᵀ over the columns X of the noises       bias = the last column
 

@@ -22,7 +22,7 @@ nodes, (27), which a cooperative measurement with H = (… H_i … H_j …) upda
 Source: patent "Cooperative estimator", equations (10)–(18) (LWIN), (23)–(26) (range), (27) (ITNS).  Departures: its
 (17) is the short form (I − KH)P, here the kernel's Joseph form; its LOS equations (21), (22) and (28) include the
 node's attitude, which is taken as known here (the direction is resolved in the common frame); its text gives the gain
-of ITNS with the composite covariance (13) of LWIN, theory section 9 rules that it acts on the joint covariance.
+of ITNS with the composite covariance (13) of LWIN; here it acts on the joint covariance, as the claims have it.
 """
 
 from __future__ import annotations
@@ -228,7 +228,7 @@ def lwin_update(
 
 
 def itns_update(joint: Estimate, H: np.ndarray, R: np.ndarray, z: Any = None) -> Estimate:
-    """Take a measurement of any nodes into the joint estimate of all, patent (27) with theory section 9.
+    """Take a measurement of any nodes into the joint estimate of all, patent (27) on the joint covariance.
 
     The kernel's update of the joint covariance.  Where R is singular, S = H P Hᵀ + R can be so too: two nodes that
     have met exactly (R = 0) agree, and measuring that again tells nothing.  The gain is then P Hᵀ S⁺ with the

@@ -1,7 +1,7 @@
 """Filters that run side by side, and the joint covariance of all their errors.
 
 Nothing is fed back into a filter, so that what each does is known beforehand, and with it how their errors hang
-together (Layh and Gebre-Egziabher 2017, appendix A; theory section 9):
+together (Layh and Gebre-Egziabher 2017, appendix A):
 
     P_12 ← (I − K_1H_1)(F_1 P_12 F_2ᵀ + Q_12)(I − K_2H_2)ᵀ + K_1 R_12 K_2ᵀ
 

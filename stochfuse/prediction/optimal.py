@@ -1,4 +1,4 @@
-"""The exact expected optimum, theory section 6: what no fusion rule can beat.
+"""The exact expected optimum, by the contact chain: what no fusion rule can beat.
 
 The contact chain (`stochfuse.engines.contact_chain`) has one path for every history of counts, the same for every item.
 The filter runs along each path, in square-root form, once for all items or, where they have noises of their own, for

@@ -72,7 +72,7 @@ def predict(
         "simplified", thesis (50)–(54), approximate (mean field);
         "general", thesis (44)–(49), exact: every outcome, its common information found by the Local Fusion Graph;
         "naive", the same with naive fusion (42)/(43);
-        "optimal", the best that any linear fusion could do with what arrived, by the contact chain (theory section 6);
+        "optimal", the best that any linear fusion could do with what arrived, by the contact chain;
         "monte-carlo", sampled.
     quantity : one of
         "claimed", the covariance that the fusion rule itself reports;
@@ -80,7 +80,7 @@ def predict(
         "optimal", the best that any linear fusion could do with what arrived, whatever the method;
         "consistency", actual / claimed, more than 1 where the rule is overconfident;
         "bias", what is left of the scenario's known initial error (initial.error);
-        "rms", the root of the mean squared error, noise and bias (theory section 7).
+        "rms", the root of the mean squared error, noise and bias.
     steady : also solve for the steady state (simplified).
     **settings : see `Settings`.
 

@@ -1,4 +1,4 @@
-"""What can be asked of an estimate's error, theory section 7: claimed, actual, bias, and what follows from them.
+"""What can be asked of an estimate's error: claimed, actual, bias, and what follows from them.
 
     claimed      P, the covariance that the fusion rule itself reports
     actual       A = Σ_sources c Cov cᵀ, the covariance that the error truly has, from its noise footprint
@@ -10,7 +10,7 @@
 All are expectations over the outcomes: E[P], E[A], E[b] and, inside the root, E[A + b bᵀ], as the thesis' (39) averages
 squared errors before it takes the root.  The consistency ratio is that of the two expectations, E[A]/E[P].
 
-Departure from the source: theory section 7 leaves open whether ratio and root are taken before or after averaging.
+The source leaves open whether ratio and root are taken before or after averaging.
 Taken of the expectations, as here, they are what the tabulated claimed, actual and bias give; over single outcomes
 they are statistics (`stochfuse predict --quantity consistency --statistic quantile:1`).
 """

@@ -10,7 +10,7 @@ the positive-definite order; P₋ = (1−ε)P and P₊ = (1+ε)P are tried for �
 is reported as the relative bound.  A bracket counts only if it holds by more than rounding can do: by `ROUNDING`, in
 units of the states' standard deviations, with g evaluated in square-root form, whose error there is below 1e-14.
 
-That there is none can be proved at no cost (theory section 16).  For an eigenvector w of F, F w = λ w, let
+That there is none can be proved at no cost.  For an eigenvector w of F, F w = λ w, let
 φ(P) = 1/(wᴴ P⁻¹ w): it is monotone and concave, the prediction multiplies it by |λ|² at least, and an update with
 H w = 0 leaves it as it is.  So φ(g_µ(P)) ≥ p |λ|² φ(P) + p φ(Q), p the probability that nothing that arrives sees w; it
 grows without end where p |λ|² > 1, and where p |λ|² = 1 and Q is positive definite.

@@ -1,4 +1,4 @@
-"""Message load: how many nodes new to an agent the messages of a step bring it (thesis 3.3, theory section 8).
+"""Message load: how many nodes new to an agent the messages of a step bring it (thesis 3.3).
 
 **What is counted.**  The load of agent i in step k is the number of nodes that the step's exchange adds to its Local
 Fusion Graph: what senders would have to send that knew what the receiver has, a lower bound for any protocol.  Own

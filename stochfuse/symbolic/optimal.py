@@ -1,4 +1,4 @@
-"""The contact chain over exact algebra: the expected optimum as a polynomial in µ (theory section 6).
+"""The contact chain over exact algebra: the expected optimum as a polynomial in µ.
 
 For n like agents with a scalar state (F = G = H = 1) and one link probability µ, every path r_1 ≥ … ≥ r_k of
 `stochfuse.engines.contact_chain` is one covariance, a rational function in those of q, r and p0 that are symbols, with

@@ -13,7 +13,7 @@ The numbers behind the thesis' figures, each calculated once: claimed covariance
 
 Every estimate here is linear in independent noises.  In one outcome of "which messages arrive" its error is x·s, where
 s holds the noises in units of their own deviations (and a last entry 1 for the known initial error) and x is the
-estimate's noise footprint (theory section 7).  Averaged over the outcomes,
+estimate's noise footprint (`stochfuse.estimators.world`).  Averaged over the outcomes,
 
     E[error]  = E[x]·s          E[error²] = sᵀ E[x xᵀ] s
 

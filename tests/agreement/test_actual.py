@@ -66,7 +66,7 @@ def test_against_simulated_worlds(network, engine, estimator):
 
 
 def test_double_counting():
-    """A common prior of 1 and one unit measurement each, fused naively: claimed 1/4, actual 3/8, right 1/3 (theory 10)."""
+    """A common prior of 1 and one unit measurement each, fused naively: claimed 1/4, actual 3/8, right 1/3."""
     source = strategies.mapping(1, 0, 1, 1, 1, 2, 2, link=1.0)
     source["initial"]["correlation"] = "shared"
     scenario = sf.Scenario.from_mapping(source | {"network": source["network"] | {"link": [0.0, 1.0]}})
@@ -81,7 +81,7 @@ def test_double_counting():
 
 @pytest.mark.parametrize("architecture", ["ad-hoc", "broadcast", "cyclic"])
 def test_the_bias_peaks_where_the_thesis_saw_the_error_rise(architecture):
-    """Figures 32, 33 (theory 7): at µ = 0.125 ad hoc and broadcast, 0.25 cyclic, where 0.5 is worse than 0."""
+    """Figures 32, 33 (handbook: what is true): at µ = 0.125 ad hoc and broadcast, 0.25 cyclic, where 0.5 is worse than 0."""
     steps = 4 if architecture == "ad-hoc" else 5  # five take 20 s; the peak is at 0.125 there too
     scenario = sf.load_scenario(architecture=architecture, steps=steps)
     link = [0.0, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0]

@@ -1,4 +1,4 @@
-"""Numbers from the literature, to their printed digits (theory section 10)."""
+"""Numbers from the literature, to their printed digits (published numbers)."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Everything that the README shows is run, and what it prints must be what the README prints.
+"""Everything that README and handbook show is run, and what it prints must be what they print.
 
-`python -m tests.cli.test_readme` writes the outputs into the README after a change that was looked at.
+`python -m tests.cli.test_readme` writes the outputs into them after a change that was looked at.
 """
 
 from __future__ import annotations
@@ -14,7 +14,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.handbook import HANDBOOK, PAGES
+
 README = Path(__file__).parents[2] / "README.md"
+DOCUMENTS = [README, *sorted(HANDBOOK.glob("*.md"))]
 CONSOLE = re.compile(r"```console\n(.*?)```", re.DOTALL)
 
 
@@ -29,8 +32,12 @@ def commands(block):
     return [(command, "\n".join(output).strip("\n")) for command, output in found]
 
 
+def everything():
+    return "\n".join(document.read_text(encoding="utf-8") for document in DOCUMENTS)
+
+
 def shown():
-    return [c for block in CONSOLE.findall(README.read_text(encoding="utf-8")) for c in commands(block)]
+    return [c for block in CONSOLE.findall(everything()) for c in commands(block)]
 
 
 def execute(command, folder):
@@ -41,8 +48,8 @@ def execute(command, folder):
 
 
 def files(folder):
-    """Write the files that the README shows, whose first line is their name in a comment."""
-    text = README.read_text(encoding="utf-8")
+    """Write the files that are shown, whose first line is their name in a comment."""
+    text = everything()
     for content, name in re.findall(r"```toml\n(# (\S+\.toml)\n.*?)```", text, re.DOTALL):
         (folder / name).write_text(content)
     return folder
@@ -58,14 +65,14 @@ def test_console_examples(command, output, folder):
     assert execute(command, folder) == output
 
 
-def test_python_example(tmp_path):
-    (code,) = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+@pytest.mark.parametrize("code", re.findall(r"```python\n(.*?)```", everything(), re.DOTALL))
+def test_python_example(code, tmp_path):
     (tmp_path / "example.py").write_text(code)
     assert "thesis-transient: 3 agents, ad-hoc; every agent alike" in execute(f"{sys.executable} example.py", tmp_path)
 
 
 def test_scenario_example_is_valid(tmp_path):
-    (text,) = re.findall(r"```toml\n(?!# trade)(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+    (text,) = re.findall(r"```toml\n(?!# )(.*?)```", everything(), re.DOTALL)
     (tmp_path / "mine.toml").write_text(text)
     assert "ok: 3 agents with 2 kinds of sensors" in execute("stochfuse scenario check mine.toml", tmp_path)
     assert "RMS of position [m]" in execute("stochfuse predict mine.toml --metric rms:position", tmp_path)
@@ -78,6 +85,23 @@ def test_the_two_set_up_commands_are_one_line_each():
     assert lines[1].endswith("-m pytest")
 
 
+def test_the_readme_is_short():
+    text = README.read_text(encoding="utf-8")
+    assert text.count("\n") <= 250
+    assert len(text.encode()) <= 14_000
+
+
+def test_links_between_documents_lead_somewhere():
+    for document in DOCUMENTS:
+        for target in re.findall(r"\]\(([^)#:]+)\)", document.read_text(encoding="utf-8")):
+            assert (document.parent / target).exists(), (document.name, target)
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_generated_pages_are_current(name):
+    assert (HANDBOOK / name).read_text(encoding="utf-8") == PAGES[name](), "python -m tests.handbook writes it"
+
+
 def rewrite():
     def fill(match):
         lines = []
@@ -87,7 +111,8 @@ def rewrite():
 
     with tempfile.TemporaryDirectory() as made:
         folder = files(Path(made))
-        README.write_text(CONSOLE.sub(fill, README.read_text(encoding="utf-8")), encoding="utf-8")
+        for document in DOCUMENTS:
+            document.write_text(CONSOLE.sub(fill, document.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 if __name__ == "__main__":

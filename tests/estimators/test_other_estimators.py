@@ -1,4 +1,4 @@
-"""The network estimators of issue 5 against naive re-derivations (`tests/oracles/textbook_estimators.py`), and their limits."""
+"""The network estimators against naive re-derivations (`tests/oracles/textbook_estimators.py`), and their limits."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ def trace_at(R, D, E, log_epsilon):
 
 
 def least_trace(v, d, n):
-    """Golden section in ln ε over ±60, 60 digits, on (EᵀS⁻¹E)⁻¹ as printed in theory section 9."""
+    """Golden section in ln ε over ±60, 60 digits, on (EᵀS⁻¹E)⁻¹ as printed in handbook, mathematics."""
     with mp.workdps(60):
         R, D, E = (mp.matrix(M.tolist()) for M in (v @ v.T, d @ d.T, np.tile(np.eye(len(v) // n, dtype=int), (n, 1))))
         low, high, ratio = mp.mpf(-60), mp.mpf(60), (mp.sqrt(5) - 1) / 2

@@ -184,7 +184,7 @@ def test_delays_are_the_general_formulation_s():
 
 @pytest.mark.parametrize("method", ["general", "naive"])
 def test_all_intervals_of_a_curve_that_first_rises(method):
-    """RMS error with a common initial bias, theory section 7: brute force on a fine grid finds the same."""
+    """RMS error with a common initial bias, handbook: what is true: brute force on a fine grid finds the same."""
     s = thesis(steps=3, agents=2)
     s = scenario(1.0, 25.0, 1.0, 100.0, 100.0, steps=3, agents=2, error=-1000.0)
     grid = np.linspace(0, 1, 20_001)

@@ -185,7 +185,7 @@ def test_invariants(n, link, architecture):
 
 
 def known_in_all(architecture, n, steps, link):
-    """Expected number of nodes of others that an agent knows in the end: Σ_t (E[r_t] − 1), theory section 6."""
+    """Expected number of nodes of others that an agent knows in the end: Σ_t (E[r_t] − 1), handbook: contact chain."""
     distribution, total = {1: 1.0}, 0.0
     for _ in range(steps):
         following = defaultdict(float)

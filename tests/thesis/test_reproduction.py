@@ -98,7 +98,7 @@ def test_every_item_makes_its_data(short, key):
 
 
 GENERAL = {
-    # theory section 10, general (49), claimed, P(k0) = 100
+    # published numbers, general (49), claimed, P(k0) = 100
     "figure-21": {
         "25 %": (77.08333, 39.70478, 32.05569, 30.22397, 29.84359),
         "50 %": (58.33333, 30.31415, 25.81867, 25.01889, 24.89674),

@@ -1,7 +1,7 @@
 """A Monte Carlo of a network on Stone Soup's Kalman components, as a user would write it, against the exact answer.
 
 Three agents of thesis-transient measure a random walk.  What an agent holds is a set of measurements; a message brings
-everything that its sender holds (theory section 6), and an agent's estimate is a Kalman filter over all it holds, run
+everything that its sender holds (handbook: contact chain), and an agent's estimate is a Kalman filter over all it holds, run
 again from the first step at which something new arrived.  An initial estimate travels as a measurement of its own
 covariance.  Noises are drawn with NumPy, which takes less time than Stone Soup's models do.
 """
