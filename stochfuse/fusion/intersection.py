@@ -5,8 +5,8 @@ and known to be independent of them) and a map H_i from the fused state.  For we
 
     C⁻¹ = Σ_i H_iᵀ (A_i1/ω_i + A_i2)⁻¹ H_i           c = C Σ_i H_iᵀ (A_i1/ω_i + A_i2)⁻¹ a_i,
 
-and C is no smaller than the actual covariance of c, whatever the correlations (Julier and Uhlmann's patent, claims 1–5).
-With D_i = H_iᵀ(A_i1/ω_i + A_i2)⁻¹ the result of two signals is split again,
+and C is no smaller than the actual covariance of c, whatever the correlations (Julier and Uhlmann's patent, claims
+1–5).  With D_i = H_iᵀ(A_i1/ω_i + A_i2)⁻¹ the result of two signals is split again,
 
     C_2 = C (D_1 A_12 D_1ᵀ + D_2 A_22 D_2ᵀ) C        C_1 = C − C_2.
 
