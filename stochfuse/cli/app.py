@@ -26,6 +26,7 @@ COMMANDS = (
     "crosscheck",
     "reproduce",
     "study",
+    "links",
     "scenario",
     "methods",
     "explain",

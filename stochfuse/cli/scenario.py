@@ -111,14 +111,13 @@ def show(
 
 def check(scenario: ScenarioArgument) -> None:
     """Check a scenario: name every key that does not fit, exit 2, or say what it describes."""
-    from stochfuse.scenario.scenario import Scenario, parse, read_text
+    from stochfuse.scenario.scenario import checked_scenario
 
-    name, text = read_text(scenario)
-    s = Scenario.from_mapping(parse(name, text), name)
+    s = checked_scenario(scenario)
     n = s.network.agents
     kinds = f" with {len(s.sensors)} kinds of sensors" if len(s.sensors) > 1 else ""
     typer.echo(
-        f"{name}: ok: {n} agent{'s' * (n > 1)}{kinds}, {s.network.architecture}, {s.network.steps} steps, "
+        f"{s.name}: ok: {n} agent{'s' * (n > 1)}{kinds}, {s.network.architecture}, {s.network.steps} steps, "
         f"state ({', '.join(s.model.states)})"
     )
 

@@ -103,8 +103,12 @@ class Scenario:
         return System.of(self)
 
     @classmethod
-    def from_mapping(cls, mapping: Mapping[str, Any], name: str = "scenario") -> Scenario:
+    def from_mapping(cls, mapping: Mapping[str, Any], name: str = "scenario", folder: Path = Path()) -> Scenario:
         """Check a mapping with a scenario file's keys and make the scenario.
+
+        Parameters
+        ----------
+        folder : what paths of files in it are relative to.
 
         Raises
         ------
@@ -113,7 +117,7 @@ class Scenario:
         """
         from stochfuse.scenario.schema import structure_problems
 
-        mapping = as_file(mapping, name)
+        mapping = _with_links(as_file(mapping, name), name, folder)
         return _build(mapping, name, structure_problems(mapping))
 
     def until(self, step: int) -> Scenario:
@@ -199,7 +203,51 @@ def load_scenario(source: str | Path | Mapping[str, Any] = DEFAULT, **overrides:
     if is_preset(source):
         # the presets' structure is checked by the tests; pydantic would double the time of a plain `predict`
         return _build(mapping, name, [])
-    return Scenario.from_mapping(mapping, name)
+    return Scenario.from_mapping(mapping, name, _folder(source))
+
+
+def _with_links(mapping: Any, name: str, folder: Path) -> Any:
+    """The mapping with the link probabilities of a file in the place of its name.
+
+    Raises
+    ------
+    ScenarioError
+        If the file does not fit the agents, or leaves a link unknown that may be heard.
+    """
+    network = mapping.get("network") if isinstance(mapping, Mapping) else None
+    given = network.get("link") if isinstance(network, Mapping) else None
+    if not isinstance(network, Mapping) or not (isinstance(given, Mapping) and isinstance(given.get("file"), str)):
+        return mapping
+    from stochfuse.scenario.links import read_links
+
+    nodes, agents = network.get("nodes"), network.get("agents")
+    try:
+        found = read_links(folder / given["file"])
+        found = found.of([str(node) for node in nodes]) if isinstance(nodes, list) else found
+    except UsageError as error:
+        raise ScenarioError(name, [Problem("network.link.file", "a file of links", f"({error})")]) from None
+    n = len(found.nodes)
+    if agents is not None and agents != n:
+        raise ScenarioError(name, [Problem("network.agents", f"{n}, the nodes of {given['file']}", str(agents))])
+    link, hears = found.link.copy(), network.get("hears")
+    for i, j in np.argwhere(np.isnan(link)).tolist():
+        heard = i != j and not (isinstance(hears, list) and i < len(hears) and j + 1 not in (hears[i] or []))
+        if heard:
+            expected = "a file that knows every link, or network.hears without the unknown ones"
+            got = f"nothing known of {found.nodes[j]} to {found.nodes[i]}"
+            raise ScenarioError(name, [Problem("network.link.file", expected, got)])
+        link[i, j] = 0.0
+    return {**mapping, "network": {**network, "agents": n, "nodes": list(found.nodes), "link": link.tolist()}}
+
+
+def checked_scenario(source: str | Path) -> Scenario:
+    """Read a scenario with every check, presets included; see `load_scenario`."""
+    name, text = read_text(source)
+    return Scenario.from_mapping(parse(name, text), name, _folder(source))
+
+
+def _folder(source: str | Path) -> Path:
+    return Path() if source == "-" or is_preset(source) else Path(source).parent
 
 
 def as_file(mapping: Any, name: str) -> Any:

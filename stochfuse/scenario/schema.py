@@ -148,17 +148,24 @@ class CaseTable(StrictTable):
     burst: BurstTable | None = Field(None, description="as network.burst, instead of a link")
 
 
+class LinkFile(StrictTable):
+    """Links from a packet log or a file of link probabilities."""
+
+    file: str = Field(description="its path, relative to the scenario file; see `stochfuse links`")
+
+
 class NetworkTable(StrictTable):
     """Who may hear whom, and how likely."""
 
     agents: int = Field(ge=1, strict=True, description="number of agents")
     steps: int = Field(ge=1, strict=True, description="number of time steps; step 1 exchanges the first estimates")
     architecture: Literal["ad-hoc", "broadcast", "cyclic"] = "ad-hoc"
-    link: Link | None = Field(
+    link: Link | LinkFile | None = Field(
         None,
         description="link probability: a number, a matrix (row: receiver, column: sender), or one of either per step; "
-        "left out, it is tabulated from 0 to 1",
+        "or { file = ... }, a packet log; left out, it is tabulated from 0 to 1",
     )
+    nodes: list[str] | None = Field(None, description="names of the agents in order: which nodes of a file they are")
     burst: BurstTable | None = Field(None, description="bursty links, instead of a link probability")
     hears: list[list[int]] | None = Field(
         None, description="for each agent the agents that it may hear; default: all that the architecture lets it hear"

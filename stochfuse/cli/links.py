@@ -1,0 +1,71 @@
+"""`stochfuse links`: link probabilities from a packet log, or from another file that people have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stochfuse.cli.options import NETWORK, OUTPUT, Written, option
+from stochfuse.errors import UsageError
+
+EXAMPLES = ("stochfuse links log.csv --plot links.png", "stochfuse links log.csv --nodes a,b,c --write network.toml")
+
+
+def links(
+    file: Annotated[
+        str,
+        typer.Argument(
+            metavar="FILE",
+            help="CSV or Parquet: a packet log, a Mercator or k7 file, an edge list or a matrix.",
+        ),
+    ],
+    columns: Annotated[
+        str | None,
+        option(
+            "The file's names of columns: sender=src,receiver=dst; of seq, received, …", NETWORK, metavar="OURS=THEIRS"
+        ),
+    ] = None,
+    nodes: Annotated[str | None, option("Only these nodes, in this order.", NETWORK, metavar="LIST")] = None,
+    sent: Annotated[
+        int | None, option("Packets behind each ratio of a k7 file that does not say.", NETWORK, min=1, metavar="N")
+    ] = None,
+    step: Annotated[
+        float | None, option("Seconds in a step: delays from sent_time and received_time.", NETWORK, metavar="S")
+    ] = None,
+    write: Annotated[Path | None, option("Write a scenario's [network] there.", OUTPUT, metavar="FILE.toml")] = None,
+    to: Written = Written(),
+) -> None:
+    """Show link probabilities with their 95 % intervals, asymmetry and memory, and what is unknown.
+
+    Of a log of received packets alone, what was sent is taken from each sender's sequence numbers.
+    """
+    from stochfuse.report.links import links_report, network_table
+    from stochfuse.report.table import check_writable, write_text
+    from stochfuse.scenario.links import read_links
+
+    to.check(file)
+    check_writable(write, (".toml",))
+    found = read_links(file, columns=_pairs(columns), sent=sent, step=step)
+    if nodes is not None:
+        found = found.of([node.strip() for node in nodes.split(",")])
+    for note in found.notes:
+        typer.echo(f"note: {note}", err=True)
+    if found.unknown:
+        some = ", ".join(f"{sender} to {receiver}" for receiver, sender in found.unknown[:5])
+        more = f" and {len(found.unknown) - 5} more" if len(found.unknown) > 5 else ""
+        typer.echo(f"note: nothing is known of {some}{more}", err=True)
+    if write is not None:
+        write_text(network_table(found), write)
+    to.write(links_report(found))
+
+
+def _pairs(text: str | None) -> dict[str, str]:
+    found = {}
+    for part in text.split(",") if text else ():
+        ours, equals, theirs = part.partition("=")
+        if not equals:
+            raise UsageError(f"--columns: expected OURS=THEIRS, got '{part}'")
+        found[ours.strip()] = theirs.strip()
+    return found

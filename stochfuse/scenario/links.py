@@ -1,0 +1,717 @@
+"""Link probabilities from what people have: packet logs, ratios, matrices and edge lists.
+
+Of n packets that a sender sent while a receiver listened s arrived: µ̂ = s/n, and the Jeffreys posterior
+Beta(s + ½, n − s + ½) gives the interval.  A link of which nothing is known is unknown (NaN), never 0; a receiver
+that listened and heard nothing of n packets is 0 of n.
+
+Memory: of successive packets n_ab followed an a by a b (0 lost, 1 received).  Without memory the second does not
+depend on the first; the likelihood ratio 2 Σ n_ab ln(n_ab n / n_a· n_·b) is then χ² of one degree of freedom.  Where
+it says otherwise, a link is fitted by two states, good and bad,
+
+    Gilbert          delivery 1 and 0: p = n_10 / n_1·, r = n_01 / n_0·
+    Gilbert–Elliott  deliveries of their own, by Baum–Welch from several starts,
+
+and the Bayesian information criterion −2 ln L + k ln n chooses between none (k = 1), Gilbert (2) and Gilbert–Elliott
+(4).
+
+Files are known by their headers: logs `seq,sender,receiver,received` or, of received packets alone,
+`seq,sender,receiver` (the numbers between a sender's first and last were sent; a counter of 16 bits may wrap);
+Mercator raw logs; k7 files of ratios; edge lists `receiver,sender,link`; matrices with the nodes' names in the first
+row and column, receivers downwards.  Arrow reads them (extra `study`).
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stochfuse.errors import StochfuseError, UsageError, nearest
+
+CONFIDENCE = 0.95
+MEMORY = 3.841458820694124
+"""95 % point of χ² with one degree of freedom."""
+LONGEST, RESTARTS, ROUNDS = 2000, 4, 100
+"""Packets of a link that Baum–Welch looks at, its starts, and its steps."""
+LONGEST_LINE = 1 << 20
+"""Letters of a line of text beyond which a file is none of these."""
+WRAP = 1 << 16
+LARGEST = float(1 << 53)
+"""Whole numbers up to which a file's are told apart."""
+COLUMNS = ("seq", "sender", "receiver", "received", "time", "sent_time", "received_time", "rssi", "link")
+
+
+@dataclass(frozen=True, eq=False)
+class Links:
+    """What is known of the links between nodes.
+
+    Parameters
+    ----------
+    source, kind : the file's name, and what it was taken for.
+    nodes : names.
+    link : (receiver, sender) estimated probability; NaN where nothing is known, and on the diagonal.
+    low, high : the same, ends of the 95 % interval; NaN where no number of packets is known.
+    sent, received : the same, numbers of packets; None where only ratios are known.
+    memory : the same, likelihood ratio for memory; None where packets have no order.
+    burst : fitted two-state models, by (receiver, sender) from 0, where a link has memory.
+    delay : probabilities of 0, 1, … steps, or None.
+    notes : what the reader should know.
+    """
+
+    source: str
+    kind: str
+    nodes: tuple[str, ...]
+    link: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    sent: np.ndarray | None = None
+    received: np.ndarray | None = None
+    memory: np.ndarray | None = None
+    burst: Mapping[tuple[int, int], Mapping[str, float]] | None = None
+    delay: tuple[float, ...] | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def unknown(self) -> list[tuple[str, str]]:
+        """Receiver and sender of links of which nothing is known."""
+        off = ~np.eye(len(self.nodes), dtype=bool)
+        return [(self.nodes[i], self.nodes[j]) for i, j in np.argwhere(np.isnan(self.link) & off)]
+
+    def of(self, nodes: Sequence[str]) -> Links:
+        """Return the links between some of the nodes, in that order.
+
+        Raises
+        ------
+        UsageError
+            If a node is not there, or named twice.
+        """
+        for node in nodes:
+            if node not in self.nodes:
+                known = ", ".join(self.nodes)
+                raise UsageError(f"nodes: expected some of {known}, got '{node}'{nearest(node, self.nodes)}")
+        if len(set(nodes)) < len(nodes):
+            raise UsageError(f"nodes: expected different ones, got {', '.join(nodes)}")
+        places = [self.nodes.index(node) for node in nodes]
+        burst = self.burst and {
+            (places.index(i), places.index(j)): fit for (i, j), fit in self.burst.items() if {i, j} <= set(places)
+        }
+        square = np.ix_(places, places)
+        counts = (None if M is None else M[square] for M in (self.sent, self.received, self.memory))
+        sent, received, memory = counts
+        return replace(
+            self,
+            nodes=tuple(nodes),
+            link=self.link[square],
+            low=self.low[square],
+            high=self.high[square],
+            sent=sent,
+            received=received,
+            memory=memory,
+            burst=burst or None,
+        )
+
+
+def links(source: Any, **how: Any) -> Links:
+    """Return what is known of links: from a file, or from a packet log as a DataFrame or a mapping of columns.
+
+    Parameters
+    ----------
+    source : a path, see `read_links`; or columns, see `links_of_packets`.
+    **how : columns, sent, step of a file; step of a log.
+
+    Raises
+    ------
+    UsageError
+        If it is none of these; with line and column.
+
+    Examples
+    --------
+    >>> import stochfuse as sf
+    >>> log = {"seq": [1, 2, 3], "sender": ["a"] * 3, "receiver": ["b"] * 3, "received": [1, 0, 1]}
+    >>> float(sf.links(log).link[1, 0].round(3))
+    0.667
+    """
+    if isinstance(source, str | Path):
+        return read_links(source, **how)
+    return links_of_packets(source, **how)
+
+
+def read_links(
+    source: str | Path,
+    *,
+    columns: Mapping[str, str] | None = None,
+    sent: int | None = None,
+    step: float | None = None,
+) -> Links:
+    """Read a file of links.
+
+    Parameters
+    ----------
+    columns : the file's names of columns, by ours.
+    sent : packets behind each ratio of a k7 file that does not say.
+    step : seconds in a step, for delays.
+
+    Raises
+    ------
+    UsageError
+        If the file is none of these; with line and column.
+    StochfuseError
+        If pyarrow is not installed.
+    """
+    name, text, table = _opened(source)
+    if table is None and text.lstrip("\ufeff").startswith("{"):
+        text = text.partition("\n")[2]
+    table = _table(name, text) if table is None else table
+    table = _renamed(name, table, columns or {})
+    known = set(table)
+    if {"mac", "srcmac"} <= known:
+        return _mercator(name, table)
+    if {"src", "dst", "pdr"} <= known:
+        return _k7(name, table, sent)
+    if {"receiver", "sender", "link"} <= known:
+        return _edges(name, table)
+    if {"sender", "receiver"} <= known and ({"seq"} <= known or {"received"} <= known):
+        return links_of_packets(table, source=name, step=step)
+    rows = _matrix_rows(table)
+    if rows is not None:
+        return _matrix(name, *rows)
+    raise UsageError(
+        f"{name}: expected columns seq, sender, receiver, received (a packet log) or receiver, sender, link (an edge "
+        f"list), or a matrix with names in its first row and column; got {', '.join(list(table)[:8])}; --columns "
+        "names others"
+    )
+
+
+def _opened(source: str | Path) -> tuple[str, str, dict[str, list[Any]] | None]:
+    path, raw = Path(source), b""
+    try:
+        if path.suffix.lower() == ".parquet":
+            found = _arrow("pyarrow.parquet").read_table(path)
+            return str(path), "", {column: found[column].to_pylist() for column in found.column_names}
+        raw = path.read_bytes()
+        raw = gzip.decompress(raw) if raw[:2] == b"\x1f\x8b" else raw
+        text = raw.decode("utf-8")
+    except FileNotFoundError:
+        raise UsageError(f"{path}: no such file") from None
+    except IsADirectoryError:
+        raise UsageError(f"{path}: expected a file, got a directory") from None
+    except UnicodeDecodeError as error:
+        line = raw[: error.start].count(b"\n") + 1
+        raise UsageError(
+            f"{path}, line {line}: expected text in UTF-8, got byte {error.object[error.start]:#04x}"
+        ) from None
+    except (OSError, EOFError, ValueError) as error:
+        raise UsageError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    if not text.strip():
+        raise UsageError(f"{path}: expected links, got an empty file")
+    return str(path), text, None
+
+
+def _table(name: str, text: str) -> dict[str, Any]:
+    """Columns of text by their names."""
+    arrow, arrow_csv = _arrow("pyarrow"), _arrow("pyarrow.csv")
+    header = text.lstrip("\ufeff").partition("\n")[0].rstrip("\r")
+    if len(header) > LONGEST_LINE:
+        raise UsageError(f"{name}, line 1: expected a line of headings, got {len(header):,} letters")
+    heads = [_one_line(head).strip('"') for head in header.split(",")]
+    if len(set(heads)) < len(heads):
+        raise UsageError(f"{name}, line 1: expected different headings, got {header[:80]}")
+    try:
+        found = arrow_csv.read_csv(
+            io.BytesIO(text.lstrip("\ufeff").encode()),
+            read_options=arrow_csv.ReadOptions(column_names=heads, skip_rows=1, block_size=LONGEST_LINE * 16),
+            convert_options=arrow_csv.ConvertOptions(
+                column_types=dict.fromkeys(heads, arrow.string()), strings_can_be_null=False
+            ),
+        )
+    except arrow.ArrowInvalid as error:
+        raise UsageError(f"{name}{_torn(text, len(heads)) or f': {_one_line(str(error))[:160]}'}") from None
+    return {head: found[head] for head in heads}
+
+
+def _torn(text: str, columns: int) -> str:
+    """Where a text ceases to be a table of so many columns; empty if it does not."""
+    rows = csv.reader(io.StringIO(text, newline=""))
+    try:
+        for row in rows:
+            if row and len(row) != columns:
+                return f", line {rows.line_num}: expected {columns} columns, got {len(row)}"
+    except csv.Error:
+        return f", line {rows.line_num + 1}: expected {columns} columns, got no text of a table"
+    return ""
+
+
+def _renamed(name: str, table: dict[str, Any], columns: Mapping[str, str]) -> dict[str, Any]:
+    for ours, theirs in columns.items():
+        if ours not in COLUMNS:
+            raise UsageError(f"--columns: expected one of {', '.join(COLUMNS)}, got '{ours}'{nearest(ours, COLUMNS)}")
+        if theirs not in table:
+            raise UsageError(
+                f"--columns: {name} has no column '{theirs}'{nearest(theirs, table)}; it has {', '.join(table)}"
+            )
+    theirs = {given: ours for ours, given in columns.items()}
+    return {theirs.get(head, head): column for head, column in table.items()}
+
+
+def links_of_packets(table: Mapping[str, Any], *, source: str = "table", step: float | None = None) -> Links:
+    """Return the links of a packet log, a row for each packet or for each that was received.
+
+    Parameters
+    ----------
+    table : columns by name: sender, receiver, and seq or received or both; a pandas DataFrame will do.
+    step : seconds in a step, for delays from sent_time and received_time.
+
+    Raises
+    ------
+    UsageError
+        If a value is none that its column can have; with the line.
+    """
+    nodes, s, r = _nodes(source, table, "sender", "receiver")
+    n = len(nodes)
+    seq = _numbers(source, table, "seq", whole=True) if "seq" in table else None
+    notes = []
+    if seq is not None:
+        _refuse(source, "seq", seq, seq < 0, "a number of at least 0")
+    pair = r * n + s
+    if "received" in table:
+        got = _numbers(source, table, "received", whole=True)
+        _refuse(source, "received", got, (got != 0) & (got != 1), "0 or 1")
+        got = got.astype(bool)
+        if seq is not None:
+            # a packet that is reported twice was sent once, and arrived if it arrived once
+            key, where = _distinct(pair, seq)
+            arrived = np.zeros(len(key), dtype=bool)
+            arrived[where[got]] = True
+            if len(key) < len(pair):
+                notes.append(f"{len(pair) - len(key):,} rows repeat a packet; each is counted once")
+            pair, seq, got = key[:, 0], key[:, 1], arrived
+        sent = np.bincount(pair, minlength=n * n).reshape(n, n)
+        heard = np.bincount(pair, got, minlength=n * n).reshape(n, n).astype(int)
+        bits = None if seq is None else (pair, seq, got)
+    else:
+        if seq is None:
+            raise UsageError(f"{source}: expected a column seq or received, got neither")
+        seq = _unwrapped(s, seq, table, source)
+        key, _ = _distinct(pair, seq)
+        if len(key) < len(pair):
+            notes.append(f"{len(pair) - len(key):,} rows repeat a packet; each is counted once")
+        heard = np.bincount(key[:, 0], minlength=n * n).reshape(n, n)
+        first, last = np.full(n, np.iinfo(int).max), np.full(n, -1)
+        np.minimum.at(first, s, seq)
+        np.maximum.at(last, s, seq)
+        listened = heard.sum(axis=1) > 0
+        sent = np.where(listened[:, None], np.maximum(last - first + 1, 0)[None], 0)
+        np.fill_diagonal(sent, 0)
+        notes.append(
+            "only received packets are logged: what each sender sent is taken from its first to its last number"
+        )
+        bits = None
+        if sent.sum() <= 50_000_000:
+            pairs, numbers, arrived = [], [], []
+            for i, j in np.argwhere(sent > 0):
+                mine = key[key[:, 0] == i * n + j, 1] - first[j]
+                flags = np.zeros(sent[i, j], dtype=bool)
+                flags[mine] = True
+                pairs.append(np.full(len(flags), i * n + j))
+                numbers.append(np.arange(len(flags)))
+                arrived.append(flags)
+            bits = (np.concatenate(pairs), np.concatenate(numbers), np.concatenate(arrived)) if pairs else None
+    memory, burst = (None, None) if bits is None else _memory(*bits, n)
+    delay = _delays(source, table, step)
+    return _counted(
+        source, "packet log", nodes, sent, heard, memory=memory, burst=burst, delay=delay, notes=tuple(notes)
+    )
+
+
+def _counted(
+    source: str, kind: str, nodes: Sequence[str], sent: np.ndarray, received: np.ndarray, **more: Any
+) -> Links:
+    from scipy.special import betaincinv
+
+    tail = (1 - CONFIDENCE) / 2
+    known = sent > 0
+    a, b = received + 0.5, sent - received + 0.5
+    low, high = (np.where(known, betaincinv(a, b, q), np.nan) for q in (tail, 1 - tail))
+    link = np.divide(received, sent, out=np.full(sent.shape, np.nan), where=known)
+    return Links(source, kind, tuple(map(str, nodes)), link, low, high, sent, received, **more)
+
+
+def _mercator(name: str, table: Mapping[str, Any]) -> Links:
+    good = np.ones(len(_words(name, table, "mac")), dtype=bool)
+    for flag in ("crc", "expected"):
+        if flag in table:
+            good &= _words(name, table, flag) == "1"
+    if not good.any():
+        raise UsageError(f"{name}: expected received packets (crc and expected 1), got none")
+    receiver, sender = _words(name, table, "mac")[good], _words(name, table, "srcmac")[good]
+    turn, packet, number = (
+        _numbers(name, table, column, whole=True, rows=good) for column in ("transctr", "pkctr", "txnumpk")
+    )
+    nodes, codes = np.unique(np.concatenate([sender, receiver]), return_inverse=True)
+    n, (s, r) = len(nodes), np.split(codes, 2)
+    key = np.unique(np.stack([r * n + s, turn, packet], axis=1), axis=0)
+    heard = np.bincount(key[:, 0], minlength=n * n).reshape(n, n)
+    turns, first = np.unique(np.stack([s, turn], axis=1), axis=0, return_index=True)
+    of_sender = np.bincount(turns[:, 0], number[first], minlength=n).astype(int)
+    sent = np.where((heard.sum(axis=1) > 0)[:, None], of_sender[None], 0)
+    np.fill_diagonal(sent, 0)
+    dropped = int((~good).sum())
+    notes = (f"{dropped:,} rows that are no packets of the experiment are left out",) if dropped else ()
+    return _counted(name, "Mercator raw log", nodes.tolist(), sent, np.minimum(heard, sent), notes=notes)
+
+
+def _k7(name: str, table: Mapping[str, Any], sent: int | None) -> Links:
+    nodes, s, r = _nodes(name, table, "src", "dst")
+    ratio = _numbers(name, table, "pdr")
+    _refuse(name, "pdr", ratio, ~((ratio >= 0) & (ratio <= 1)), "a ratio between 0 and 1")
+    counts = _numbers(name, table, "tx_count", empty=np.nan) if "tx_count" in table else np.full(len(ratio), np.nan)
+    counts = np.where(np.isnan(counts) if sent is not None else False, float(sent or 0), counts)
+    n, pair = len(nodes), r * len(nodes) + s
+    if np.isfinite(counts).all() and counts.sum() > 0:
+        total = np.bincount(pair, counts, minlength=n * n).reshape(n, n)
+        heard = np.bincount(pair, counts * ratio, minlength=n * n).reshape(n, n)
+        return _counted(name, "k7 ratios", nodes, np.rint(total).astype(int), np.rint(heard).astype(int))
+    rows = np.bincount(pair, minlength=n * n).reshape(n, n)
+    mean = np.bincount(pair, ratio, minlength=n * n).reshape(n, n)
+    link = np.divide(mean, rows, out=np.full((n, n), np.nan), where=rows > 0)
+    note = "ratios without numbers of packets: no interval; --sent N says how many each stands for"
+    unknown = np.full((n, n), np.nan)
+    return Links(name, "k7 ratios", tuple(nodes), link, unknown, unknown, notes=(note,))
+
+
+def _edges(name: str, table: Mapping[str, Any]) -> Links:
+    nodes, s, r = _nodes(name, table, "sender", "receiver")
+    values = _numbers(name, table, "link")
+    _refuse(name, "link", values, ~((values >= 0) & (values <= 1)), "a probability between 0 and 1")
+    link = np.full((len(nodes), len(nodes)), np.nan)
+    _, first = np.unique(r * len(nodes) + s, return_index=True)
+    again = np.ones(len(values), dtype=bool)
+    again[first] = False
+    _refuse(name, "link", values, again, "each link once")
+    link[r, s] = values
+    return Links(name, "edge list", tuple(nodes), link, np.full_like(link, np.nan), np.full_like(link, np.nan))
+
+
+def _matrix_rows(table: Mapping[str, Any]) -> tuple[list[str], list[str], list[list[str]]] | None:
+    heads = list(table)
+    columns = [[str(cell) for cell in _listed(table[head])] for head in heads]
+    named = not heads[0] or set(heads[1:]) & {cell.strip() for cell in columns[0]}
+    if len(heads) < 2 or len(columns[0]) != len(heads) - 1 or not named:
+        return None
+    return columns[0], heads[1:], [list(row) for row in zip(*columns[1:], strict=True)]
+
+
+def _matrix(name: str, rows: list[str], heads: list[str], cells: list[list[str]]) -> Links:
+    rows, heads = [r.strip() for r in rows], [h.strip() for h in heads]
+    if rows != heads:
+        got = f"{', '.join(rows[:4])} … and {', '.join(heads[:4])} …"
+        raise UsageError(f"{name}: expected the same names in the first row and column, got {got}")
+    link = np.full((len(rows), len(rows)), np.nan)
+    for i, row in enumerate(cells):
+        for j, cell in enumerate(row):
+            if i == j or not cell.strip():
+                continue
+            try:
+                link[i, j] = float(cell)
+            except ValueError:
+                link[i, j] = -1
+            if not 0 <= link[i, j] <= 1:
+                where, got = f"{name}, line {i + 2}, column '{heads[j]}'", cell.strip()[:40]
+                raise UsageError(f"{where}: expected a probability between 0 and 1, got '{got}'")
+    return Links(name, "matrix", tuple(rows), link, np.full_like(link, np.nan), np.full_like(link, np.nan))
+
+
+def _listed(column: Any) -> list[Any]:
+    return column.to_pylist() if hasattr(column, "to_pylist") else list(column)
+
+
+def _words(name: str, table: Mapping[str, Any], column: str) -> np.ndarray:
+    if column not in table:
+        raise UsageError(f"{name}: expected a column {column}, got {', '.join(map(str, table))}")
+    given = table[column]
+    words = given.to_numpy() if hasattr(given, "to_numpy") else np.asarray(given)
+    words = np.asarray(words).astype(str)
+    blank = np.char.strip(words) == "" if words.size else np.zeros(0, dtype=bool)
+    _refuse(name, column, words, blank | (words == "nan") | (words == "None"), "a name")
+    return np.char.strip(words) if words.size else words
+
+
+def _numbers(
+    name: str,
+    table: Mapping[str, Any],
+    column: str,
+    *,
+    whole: bool = False,
+    empty: float | None = None,
+    rows: Any = slice(None),
+) -> np.ndarray:
+    """Numbers of a column; with `whole` integers; an empty cell is `empty`, or refused."""
+    given = table[column]
+    if hasattr(given, "dictionary_encode"):
+        given = _cast(given)
+    raw = given.to_numpy() if hasattr(given, "to_numpy") else np.asarray(given)
+    if raw.dtype.kind in "biuf":
+        values = raw.astype(float)
+    else:
+        words = np.asarray(raw).astype(str)
+        words = np.where(np.char.strip(words) == "", "nan", words)
+        try:
+            values = words.astype(float)
+        except ValueError:
+            values = np.array([_number(word) for word in words])
+        bad = np.isinf(values) | (np.isnan(values) & (np.char.lower(words) != "nan"))
+        kept = np.zeros(len(values), dtype=bool)
+        kept[rows] = True
+        _refuse(name, column, words, bad & kept, "a whole number" if whole else "a number")
+    values = values[rows]
+    lines = np.arange(len(raw))[rows]
+    if empty is None:
+        _refuse(name, column, values, np.isnan(values), "a whole number" if whole else "a number", lines)
+    if whole:
+        wrong = (values != np.rint(values)) | (np.abs(values) > LARGEST)
+        _refuse(name, column, values, wrong, "a whole number", lines)
+        return np.rint(values).astype(np.int64)
+    return values
+
+
+def _cast(column: Any) -> Any:
+    """A column of texts as numbers, if all of them are; else as it is."""
+    try:
+        return column.cast("float64")
+    except (ValueError, TypeError):
+        return column
+
+
+def _number(word: str) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        return np.inf
+
+
+def _refuse(
+    name: str, column: str, values: np.ndarray, bad: np.ndarray, expected: str, lines: np.ndarray | None = None
+) -> None:
+    found = np.flatnonzero(bad)
+    if len(found):
+        line = int(found[0] if lines is None else lines[found[0]]) + 2
+        got = str(values[found[0]])
+        got = "nothing" if got in ("", "nan") else f"'{_one_line(got)[:40]}'"
+        raise UsageError(f"{name}, line {line}, column '{column}': expected {expected}, got {got}")
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
+
+
+def _natural(nodes: Sequence[str] | np.ndarray) -> tuple[list[str], np.ndarray]:
+    """Names in the order that a reader expects (2 before 10), and the new place of each."""
+    import re
+
+    def key(name: str) -> list[tuple[int, int, str]]:
+        return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]
+
+    order = sorted(range(len(nodes)), key=lambda i: key(str(nodes[i])))
+    places = np.empty(len(nodes), dtype=int)
+    places[order] = np.arange(len(nodes))
+    return [str(nodes[i]) for i in order], places
+
+
+def _nodes(name: str, table: Mapping[str, Any], sender: str, receiver: str) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """Names of all nodes, and the places of each row's sender and receiver among them."""
+    (from_names, s), (to_names, r) = _coded(name, table, sender), _coded(name, table, receiver)
+    nodes, _ = _natural(sorted({*from_names, *to_names}))
+    place = {node: i for i, node in enumerate(nodes)}
+    s, r = (
+        np.array([place[node] for node in names], dtype=np.int64)[codes]
+        for names, codes in ((from_names, s), (to_names, r))
+    )
+    if (s == r).any():
+        _refuse(name, receiver, np.array(nodes)[r], s == r, "another node than the sender")
+    return nodes, s, r
+
+
+def _coded(name: str, table: Mapping[str, Any], column: str) -> tuple[list[str], np.ndarray]:
+    """Different names in a column, and which of them each row has."""
+    if column not in table:
+        raise UsageError(f"{name}: expected a column {column}, got {', '.join(map(str, table))}")
+    given = table[column]
+    if hasattr(given, "dictionary_encode"):
+        encoded = given.dictionary_encode().combine_chunks()
+        names, codes = encoded.dictionary.to_pylist(), encoded.indices.to_numpy(zero_copy_only=False)
+    else:
+        names, codes = np.unique(np.asarray(given).astype(str), return_inverse=True)
+    words = [_one_line(str(word)) for word in names]
+    wrong = np.array([word in ("", "nan", "None") for word in words], dtype=bool)
+    if wrong.any():
+        _refuse(name, column, np.array(words)[codes], wrong[codes], "a name")
+    return words, codes.astype(np.int64)
+
+
+def _distinct(pair: np.ndarray, seq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Different (pair, seq), sorted, and the place of each row among them."""
+    span = int(seq.max(initial=0)) + 1
+    if int(pair.max(initial=0)) + 1 > np.iinfo(np.int64).max // span:
+        raise UsageError(
+            f"seq: expected numbers below {np.iinfo(np.int64).max // (int(pair.max()) + 1):.3g}, got {span - 1:.3g}"
+        )
+    code, where = np.unique(pair * span + seq, return_inverse=True)
+    return np.stack(np.divmod(code, span), axis=1), where
+
+
+def _unwrapped(sender: np.ndarray, seq: np.ndarray, table: Mapping[str, Any], source: str) -> np.ndarray:
+    """Sequence numbers of each sender, a counter of 16 bits unrolled in order of time, or of the file."""
+    if seq.max(initial=0) >= WRAP:
+        return seq
+    clock = next((name for name in ("received_time", "time", "sent_time") if name in table), None)
+    when = np.arange(len(seq)) if clock is None else _numbers(source, table, clock)
+    out = seq.copy()
+    for one in np.unique(sender):
+        mine = np.flatnonzero(sender == one)
+        mine = mine[np.argsort(when[mine], kind="stable")]
+        jumps = np.diff(seq[mine])
+        turns = np.concatenate([[0], np.cumsum((jumps < -WRAP // 2).astype(int) - (jumps > WRAP // 2))])
+        out[mine] = seq[mine] + WRAP * (turns - turns.min())
+    return out
+
+
+def _memory(pair: np.ndarray, seq: np.ndarray, got: np.ndarray, n: int) -> tuple[np.ndarray, dict | None]:
+    """Likelihood ratio for memory of every link, and the two-state models of those that have some."""
+    order = np.lexsort((seq, pair))
+    pair, got = pair[order], got[order].astype(int)
+    same = pair[1:] == pair[:-1]
+    counts = np.zeros((n * n, 2, 2))
+    np.add.at(counts, (pair[1:][same], got[:-1][same], got[1:][same]), 1)
+    total = counts.sum(axis=(1, 2), keepdims=True)
+    expected = counts.sum(axis=2, keepdims=True) * counts.sum(axis=1, keepdims=True) / np.maximum(total, 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        terms = np.where(counts > 0, counts * np.log(counts / expected), 0.0)
+    ratio = 2 * terms.sum(axis=(1, 2))
+    # where the criterion prefers no memory to the best chain, two hidden states need not be tried
+    remembering = np.flatnonzero(ratio > np.maximum(MEMORY, np.log(np.maximum(total[:, 0, 0], 1))))
+    starts = np.searchsorted(pair, remembering), np.searchsorted(pair, remembering, side="right")
+    records = [got[a:b][:LONGEST] for a, b in zip(*starts, strict=True)]
+    fits = dict(zip(remembering.tolist(), _two_states(records, counts[remembering]), strict=True))
+    found = {divmod(place, n): fit for place, fit in fits.items() if fit is not None}
+    shown = np.where(total[:, 0, 0] > 0, ratio, np.nan).reshape(n, n)
+    return shown, found or None
+
+
+def _two_states(records: Sequence[np.ndarray], counts: np.ndarray) -> list[dict[str, float] | None]:
+    """The two-state model that BIC prefers for each record of 0 and 1; None where it prefers none."""
+    if not records:
+        return []
+    fitted = _baum_welch(records)
+    out: list[dict[str, float] | None] = []
+    for record, whole, (model, likelihood) in zip(records, counts, fitted, strict=True):
+        n, s = len(record), int(record.sum())
+        none, c = _log(s, n), np.zeros((2, 2))
+        np.add.at(c, (record[:-1], record[1:]), 1)
+        p, r = (whole[1, 0] / max(whole[1].sum(), 1), whole[0, 1] / max(whole[0].sum(), 1))
+        first = np.log(max(s if record[0] else n - s, 1) / n)
+        gilbert = first + _log(c[1, 0], c[1].sum()) + _log(c[0, 1], c[0].sum())
+        scores = {
+            "none": np.log(n) - 2 * none,
+            "gilbert": 2 * np.log(n) - 2 * gilbert,
+            "elliott": 4 * np.log(n) - 2 * likelihood,
+        }
+        best = min(scores, key=lambda name: scores[name])
+        if best == "gilbert" and 0 < p < 1 and 0 < r < 1:
+            out.append({"good_to_bad": float(p), "bad_to_good": float(r), "good": 1.0, "bad": 0.0})
+        elif best == "elliott":
+            out.append(model)
+        else:
+            out.append(None)
+    return out
+
+
+def _log(s: float, n: float) -> float:
+    """Log-likelihood of s of n at their own ratio."""
+    if not n or s in (0, n):
+        return 0.0
+    return float(s * np.log(s / n) + (n - s) * np.log(1 - s / n))
+
+
+def _baum_welch(records: Sequence[np.ndarray]) -> list[tuple[dict[str, float], float]]:
+    """Gilbert–Elliott models of largest likelihood, all records and starts side by side."""
+    longest = max(map(len, records))
+    seen = np.zeros((len(records), longest), dtype=int)
+    there = np.zeros((len(records), longest), dtype=bool)
+    for i, record in enumerate(records):
+        seen[i, : len(record)], there[i, : len(record)] = record, True
+    seen, there = np.repeat(seen, RESTARTS, axis=0), np.repeat(there, RESTARTS, axis=0)
+    starts = np.array([(0.1, 0.1, 0.95, 0.2), (0.3, 0.3, 0.9, 0.4), (0.02, 0.2, 0.99, 0.05), (0.2, 0.02, 0.8, 0.1)])
+    p, r, good, bad = np.tile(starts[:RESTARTS], (len(records), 1)).T.copy()
+    likelihood = np.full(len(p), -np.inf)
+    for _ in range(ROUNDS):
+        T = np.stack([np.stack([1 - p, p], -1), np.stack([r, 1 - r], -1)], axis=1)  # (items, from, to), good first
+        E = np.stack([good, bad], -1)
+        emitted = np.where(seen[:, :, None] == 1, E[:, None], 1 - E[:, None])
+        emitted = np.where(there[:, :, None], emitted, 1.0)
+        alpha, scale = np.empty((longest, len(p), 2)), np.empty((longest, len(p)))
+        state = np.stack([r, p], -1) / (p + r)[:, None]
+        for t in range(longest):
+            state = state * emitted[:, t] if t == 0 else (state[:, None] @ T)[:, 0] * emitted[:, t]
+            scale[t] = state.sum(axis=1)
+            state = state / scale[t][:, None]
+            alpha[t] = state
+        new = np.where(there.T, np.log(scale), 0.0).sum(axis=0)
+        if (new - likelihood < 1e-6 * np.maximum(1, np.abs(new))).all():
+            break
+        likelihood = new
+        beta = np.ones((len(p), 2))
+        moves, visits, hits = np.zeros((len(p), 2, 2)), np.zeros((len(p), 2)), np.zeros((len(p), 2))
+        for t in range(longest - 1, -1, -1):
+            gamma = alpha[t] * beta
+            gamma /= gamma.sum(axis=1, keepdims=True)
+            visits += np.where(there[:, t, None], gamma, 0)
+            hits += np.where((there[:, t] & (seen[:, t] == 1))[:, None], gamma, 0)
+            if t:
+                flow = alpha[t - 1][:, :, None] * T * (emitted[:, t] * beta)[:, None] / scale[t][:, None, None]
+                moves += np.where(there[:, t, None, None], flow, 0)
+                beta = (T @ (emitted[:, t] * beta)[:, :, None])[:, :, 0] / scale[t][:, None]
+        out = moves.sum(axis=2)
+        tiny = 1e-6
+        p, r = (np.clip(moves[:, a, 1 - a] / np.maximum(out[:, a], 1e-12), tiny, 1 - tiny) for a in (0, 1))
+        good, bad = (np.clip(hits[:, a] / np.maximum(visits[:, a], 1e-12), tiny, 1 - tiny) for a in (0, 1))
+    best = likelihood.reshape(-1, RESTARTS).argmax(axis=1) + RESTARTS * np.arange(len(records))
+    found = []
+    for i in best:
+        model = {"good_to_bad": p[i], "bad_to_good": r[i], "good": good[i], "bad": bad[i]}
+        if model["good"] < model["bad"]:
+            model = {"good_to_bad": r[i], "bad_to_good": p[i], "good": bad[i], "bad": good[i]}
+        found.append(({key: float(value) for key, value in model.items()}, float(likelihood[i])))
+    return found
+
+
+def _delays(source: str, table: Mapping[str, Any], step: float | None) -> tuple[float, ...] | None:
+    if step is None:
+        return None
+    if not step > 0:
+        raise UsageError(f"--step: expected seconds above 0, got {step:g}")
+    if "sent_time" not in table or "received_time" not in table:
+        raise UsageError(
+            f"{source}: expected columns sent_time and received_time for delays, got {', '.join(map(str, table))}"
+        )
+    left, came = (_numbers(source, table, name, empty=np.nan) for name in ("sent_time", "received_time"))
+    took = came - left
+    _refuse(source, "received_time", took, took < 0, "no time before sent_time")
+    steps = np.floor(took[np.isfinite(took)] / step + 1e-9).astype(int)
+    if not len(steps):
+        raise UsageError(f"{source}: expected packets with sent_time and received_time, got none")
+    return tuple((np.bincount(steps) / len(steps)).tolist())
+
+
+def _arrow(name: str) -> Any:
+    from importlib import import_module
+
+    try:
+        return import_module(name)
+    except ImportError:
+        raise StochfuseError("files of links need pyarrow: pip install 'stochfuse[study]'") from None
