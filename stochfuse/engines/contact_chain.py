@@ -20,6 +20,10 @@ time; a stationary chain of two states looks the same backwards, so what is know
 failed: the age of i.  The link succeeds with the probability of a delivery after so many failures in a row.  With
 delays as well, a failure at age a is a message that was lost or came later than a steps.
 
+Detections.  Of the r agents in S at step t ≥ 2 only those count whose sensors measured there, each with its probability
+by itself: Binomial(r, p) of every kind.  Who is in S does not depend on it, so that a state is split by what was
+measured in it (`_measured`).
+
 The contact chain: the exact expected optimum, in a handful of terms.
 
 If fusion lost nothing, an agent's covariance would be that of one filter with everything it holds,
@@ -44,8 +48,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations_with_replacement
-from math import comb
+from itertools import combinations_with_replacement, product
+from math import comb, prod
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -70,6 +74,7 @@ from stochfuse.scenario.network import LinkRows, Network, delivery_after_failure
 
 MOST_STATES = 4096
 """States of the chain."""
+NO_MEASUREMENT = 1e-150
 MOST_AGENTS, MOST_UNLIKE = 500, 12
 """Agents that are alike, and agents that are not."""
 
@@ -84,21 +89,30 @@ class Contacts:
     starts : state before the exchange at the last step, for each group of agents.
     transition : T(s → s′) at a step, shape (rows, states, states), for some of the rows.
     constant : whether it is the same at every step.
+    falling : whether no count of a path is larger than one of an earlier step.
     """
 
     held: np.ndarray
     starts: tuple[int, ...]
     transition: Callable[[int, slice | np.ndarray], np.ndarray]
     constant: bool
+    falling: bool = True
 
 
-def contacts(network: Network, rows: LinkRows, kinds: Sequence[int], groups: Sequence[tuple[int, ...]]) -> Contacts:
+def contacts(
+    network: Network,
+    rows: LinkRows,
+    kinds: Sequence[int],
+    groups: Sequence[tuple[int, ...]],
+    detects: np.ndarray | None = None,
+) -> Contacts:
     """Return the chain of a network.
 
     Parameters
     ----------
     kinds : kind of sensor of every agent.
     groups : agents that are alike, one start for each.
+    detects : (steps, kinds) probability that a sensor measures; None where all is certain.
 
     Raises
     ------
@@ -107,14 +121,47 @@ def contacts(network: Network, rows: LinkRows, kinds: Sequence[int], groups: Seq
     """
     bursty = rows.bursts is not None
     oldest = network.steps - 1 if bursty else min(len(network.delay), network.steps) - 1
-    if len(set(kinds)) == 1 and rows.uniform:
-        return _of_counts(network, rows, oldest)
-    return _of_sets(network, rows, kinds, groups, oldest)
+    if len(set(kinds)) == 1 and rows.uniform and network.delays is None:
+        found = _of_counts(network, rows, oldest)
+    else:
+        found = _of_sets(network, rows, kinds, groups, oldest)
+    return found if detects is None else _measured(found, detects[:, sorted(set(kinds))], network)
 
 
-def by_age(network: Network, µ: np.ndarray, burst: np.ndarray | None, oldest: int) -> np.ndarray:
-    """Probability that a link into a member of age 0 … oldest brings its sender in, (rows, ages)."""
-    in_time = np.cumsum(network.delay)[np.minimum(range(oldest + 1), len(network.delay) - 1)]
+def _measured(all_held: Contacts, detects: np.ndarray, network: Network) -> Contacts:
+    """Split every state by how many agents of each kind measured in it."""
+    missing = detects.min(axis=0) < 1.0
+    ranges = [
+        [range(r + 1) if missing[kind] else (r,) for kind, r in enumerate(counts)] for counts in all_held.held.tolist()
+    ]
+    if sum(prod(map(len, each)) for each in ranges) > MOST_STATES:
+        raise _too_many(network)
+    split = [(state, counts) for state, each in enumerate(ranges) for counts in product(*each)]
+    of, counts = np.array([state for state, _ in split]), np.array([counts for _, counts in split])
+    held = all_held.held[of]
+    ways = np.array([prod(map(comb, *pair)) for pair in zip(held.tolist(), counts.tolist(), strict=True)], dtype=float)
+
+    def share(step: int) -> np.ndarray:
+        """Probability of what was measured in each state."""
+        p = detects[step - 1]
+        return ways * (p**counts * (1.0 - p) ** (held - counts)).prod(axis=1)
+
+    def transition(step: int, some: slice | np.ndarray) -> np.ndarray:
+        return all_held.transition(step, some)[:, of][:, :, of] * share(step)
+
+    # what is measured at the last step is no part of what an agent holds before its exchange
+    starts = tuple(int(np.flatnonzero(of == start)[0]) for start in all_held.starts)
+    return Contacts(counts, starts, transition, constant=False, falling=False)
+
+
+def by_age(delay: Sequence[float], µ: np.ndarray, burst: np.ndarray | None, oldest: int) -> np.ndarray:
+    """Probability that a link into a member of age 0 … oldest brings its sender in, (rows, ages).
+
+    Parameters
+    ----------
+    delay : probabilities of a delay of 0, 1, 2 … steps.
+    """
+    in_time = np.cumsum(delay)[np.minimum(range(oldest + 1), len(delay) - 1)]
     return µ[:, None] * in_time if burst is None else delivery_after_failures(burst, in_time)
 
 
@@ -134,7 +181,7 @@ def _of_counts(network: Network, rows: LinkRows, oldest: int) -> Contacts:
 
     def transition(step: int, some: slice | np.ndarray) -> np.ndarray:
         µ = rows.at_step(step)
-        success = by_age(network, µ, rows.chain(µ), oldest)[some]
+        success = by_age(network.delay, µ, rows.chain(µ), oldest)[some]
         T = np.zeros((len(success), len(states), len(states)))
         for s, (_, ages) in enumerate(states):
             failed = (1.0 - success[:, list(ages)]).prod(axis=1)
@@ -213,7 +260,7 @@ def _of_sets(
 
     def transition(step: int, some: slice | np.ndarray) -> np.ndarray:
         drawn = events(network, rows, step)
-        success = [by_age(network, e.probability, e.burst, oldest)[some] for e in drawn]
+        success = [by_age(e.delay, e.probability, e.burst, oldest)[some] for e in drawn]
         T = np.zeros((len(rows.link[some]), len(found), len(found)))
         for s, state in enumerate(digits):
             probability = np.ones((len(T), 1))
@@ -326,13 +373,14 @@ class LosslessFilter(NamedTuple):
             for H, R, n in arrived:
                 J = H.T @ np.linalg.solve(R, H)  # all that a measurement of a scalar says, whatever its size
                 if J.any():
-                    estimate = update(estimate, np.ones((1, 1)), 1.0 / (J * n[..., None, None]), np.zeros((1, 1)))
+                    R = 1.0 / (J * _at_least(n)[..., None, None])
+                    estimate = update(estimate, np.ones((1, 1)), R, np.zeros((1, 1)))
             return AlongPath(*estimate)
         x, L = before.x, given.rounded(predict_factor(given.rounded(before.root), F, given.factor(Q)))
         x = x if x is None else F @ x
         for H, R, n in arrived:
             L = update_factor(L, H, R, lambda s: 1.0 / (1.0 + n[..., None] * s))  # noqa: B023
-            x = x if x is None else x - posterior_gain(L, H, R / n[..., None, None]) @ (H @ x)
+            x = x if x is None else x - posterior_gain(L, H, R / _at_least(n)[..., None, None]) @ (H @ x)
         return AlongPath(x, L)
 
     def covariance(self, carried: AlongPath) -> np.ndarray:
@@ -343,6 +391,11 @@ class LosslessFilter(NamedTuple):
     def scalar(self) -> bool:
         """Whether the state has one component."""
         return self.model.dimension == 1
+
+
+def _at_least(n: np.ndarray) -> np.ndarray:
+    """Numbers of measurements to divide noise by, where in a stack some are none."""
+    return np.maximum(n, NO_MEASUREMENT)
 
 
 class Chain(NamedTuple):
@@ -460,7 +513,8 @@ def over_paths(
     paths, before = 0, np.empty(0)
     for step, T in enumerate(transitions(contacts, steps, some), start=1):
         if step == 1:
-            ones = {c: np.ones((len(T), len(states[c]), 1)) for c in range(len(counts))}
+            # at step 1 everybody has a first estimate
+            ones = {c: np.ones((len(T), len(states[c]), 1)) for c in range(len(counts)) if counts[c].any()}
             classes = {c: Class(given.start(counts[c]), weight) for c, weight in ones.items()}
         else:
             classes = _grown(given, classes, before, counts, states, step)

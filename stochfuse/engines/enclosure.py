@@ -8,8 +8,9 @@ side by side, the two enclose it, and the gap falls with the square of the cell'
 Matrix models merge paths that agree in their last counts.  P(r_1 … r_t) falls, in the positive-definite order, with
 every count, and no count grows with time.  Among all paths r_1 ≥ … ≥ r_t with the last L counts given, the one whose
 earlier counts are the least possible has the largest P and the one whose earlier counts are the greatest possible the
-smallest.  The filter forgets, so that the two are close; they are carried instead of the rest.  L is the largest for
-which the paths are few.  (Pruning: a count that no row of links makes possible is not followed.)
+smallest; so with counts of what was measured where sensors may miss, whose least and greatest are 0 and all after any
+count.  The filter forgets, so that the two are close; they are carried instead of the rest.  L is the largest for which
+the paths are few.  (Pruning: a count that no row of links makes possible is not followed.)
 
 Rounding, some 1e-13, comes on top of either.
 """
@@ -81,9 +82,11 @@ def _on_a_grid(given: LosslessFilter, contacts: Contacts, steps: int, some: slic
             out[..., here, :] = given.after(AlongPath(None, P[..., here, :, :, :]), count, step).root[..., 0, 0]
         return out
 
-    start = np.empty(len(contacts.held))
+    # at step 1 everybody has a first estimate: what a state without one would start from does not matter
+    start = np.full(len(contacts.held), given.covariance(given.start(counts[-1])).item())
     for count, here in zip(counts, states, strict=True):
-        start[here] = given.covariance(given.start(count)).item()
+        if count.any():
+            start[here] = given.covariance(given.start(count)).item()
     nodes = _nodes(start, after, steps)
     shape = (len(range(*some.indices(some.stop))), len(start), len(nodes))
     low = _split(nodes, np.broadcast_to(start[:, None], (*shape[:2], 1)), np.ones((*shape[:2], 1)))
@@ -154,12 +157,16 @@ def _by_last_counts(
     if counts.shape[1] > 1:
         check_size(np.inf)
     n = len(counts)  # in order: more agents, a smaller P
-    window = max(L for L in range(1, steps + 1) if L == 1 or comb(n + L - 1, L) <= MOST_MERGED)
+
+    def merged(L: int) -> int:
+        return comb(n + L - 1, L) if contacts.falling else n**L
+
+    window = max(L for L in range(1, steps + 1) if L == 1 or merged(L) <= MOST_MERGED)
     classes: dict[int, _Merged] = {}
     lower, upper, before = [], [], np.empty(0)
     for step, T in enumerate(transitions(contacts, steps, some), start=1):
         if step == 1:
-            for c in range(n):
+            for c in np.flatnonzero(counts.any(axis=1)).tolist():
                 L = given.start(counts[c]).root
                 classes[c] = _Merged(np.array([[c]]), L, L, np.ones((len(T), len(states[c]), 1)))
         else:

@@ -8,8 +8,8 @@ of a distributive lattice on n generators (18 for n = 3) instead of one for each
 
     Y_A(k) = Σ_{i∈A} local_i(∪S_i) + Σ_{T⊆A, |T|≥2} (−1)^(|T|+1) · common(∩_{i∈T} ∪S_i)
 
-is summed in floating point, for all states and outcomes at once.  With delays, or more agents than fit a machine word,
-the last exchange is carried out instead.
+is summed in floating point, for all states and outcomes at once.  With delays, sensors that may miss, or more agents
+than fit a machine word, the last exchange is carried out instead.
 
 Outcomes in which the same is claimed are one from there on (`claims_of`): of three agents ad hoc, 48,236 outcomes of
 the last two exchanges at step 4 claim 2,613 different sums.  Whether two sums of information are the same sum is told
@@ -29,10 +29,11 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from stochfuse.engines.events import Event, Outcome, Rows, Weights, concerning, fates, outcomes
+from stochfuse.engines.events import Event, Outcome, Rows, Weights, concerning, number_of_outcomes, outcomes
 from stochfuse.engines.progress import listener, uncollected
 from stochfuse.errors import TooManyError
 from stochfuse.estimators.protocol import AdditiveEstimator, Estimator
+from stochfuse.scenario.system import Detection
 
 MOST_GENERATORS = 6
 """Agents up to which truth tables of the lattice fit 64 bits."""
@@ -93,24 +94,24 @@ class Request:
     Parameters
     ----------
     agents, steps : numbers of agents and steps.
-    delay : probabilities of 0, 1, 2 … steps of delay.
     events : events of a step.
     weights : bookkeeping of probabilities.
     groups : agents that are alike.
     most : states that may be carried at a time.
     prune : whether the least likely states are left out where there are more, instead of giving up.
     plain : carry every outcome to the end, merge nothing: for tests and benchmarks.
+    detections : draws of what is measured at a step.
     """
 
     agents: int
     steps: int
-    delay: tuple[float, ...]
     events: Callable[[int], list[Event]]
     weights: Weights
     groups: tuple[tuple[int, ...], ...]
     most: int = 100_000
     prune: bool = False
     plain: bool = False
+    detections: Callable[[int], list[Detection]] = lambda step: []
 
 
 class Structure(NamedTuple):
@@ -144,14 +145,16 @@ def _enumerate(estimator: Estimator, request: Request) -> Structure:
     weights, n, steps = request.weights, request.agents, request.steps
     drawn = [request.events(step) for step in range(1, steps + 1)]
     events_up_to = np.cumsum([len(d) for d in drawn]).tolist()
+    seen = [request.detections(step) for step in range(1, steps + 1)]
     number = [1]
     for step, d in enumerate(drawn, start=1):
-        number.append(number[-1] * len(fates(request.delay, steps - step)) ** len(d))
+        number.append(number[-1] * number_of_outcomes(d, steps - step, seen[step - 1]))
     sums = cast(AdditiveEstimator, estimator)
     two_steps = (
         estimator.additive
         and not weights.memory
-        and request.delay == (1.0,)
+        and all(event.delay == (1.0,) for d in drawn for event in d)
+        and not any(seen)
         and n <= MOST_GENERATORS
         and not request.plain
     )
@@ -169,7 +172,7 @@ def _enumerate(estimator: Estimator, request: Request) -> Structure:
             left = steps - step + 1
             expected = _expected(sizes, len(layer) * number[step - 1] // number[step - 2], len(estimator.relabellings))
             in_the_end = _extrapolated(sizes, expected, steps - step - two_steps)
-            _check_exchange(before, len(fates(request.delay, left)), number[steps], request)
+            _check_exchange(number_of_outcomes(before, left, seen[step - 1]), number[steps], request)
             # the first exchange says nothing yet of an estimator that forgets, or whose agents are soon alike
             hopeless = len(sizes) > 1 and in_the_end > 10 * request.most
             if expected > LONG or hopeless:
@@ -179,7 +182,7 @@ def _enumerate(estimator: Estimator, request: Request) -> Structure:
             if not announced and expected > LONG:
                 listener().expect(number[steps], in_the_end)
                 announced = True
-            possible = outcomes(before, n, request.delay, left, weights)
+            possible = outcomes(before, n, left, weights, seen[step - 1])
             layer = _next_layer(estimator, layer, possible, step - 1, request)
             layer = dict(zip(layer, weights.between(list(layer.values())), strict=True)) if weights.memory else layer
             if request.prune and len(layer) > request.most:
@@ -206,9 +209,9 @@ def _next_layer(
         exchange = state if request.plain else estimator.exchange(state)
         for outcome in possible:
             if request.plain:
-                after = exchange.onward(outcome.heard, outcome.late)
+                after = exchange.onward(outcome.heard, outcome.late, outcome.missed)
             else:
-                after, _ = exchange.after(outcome.heard, outcome.late)
+                after, _ = exchange.after(outcome.heard, outcome.late, outcome.missed)
             new = times(weight, outcome.factor)
             known = found.get(after)
             found[after] = new if known is None else known + new
@@ -240,10 +243,10 @@ def _extrapolated(sizes: list[int], expected: int, further: int) -> int:
     return round(expected * (Decimal(expected) / sizes[-1]) ** max(0, further))
 
 
-def _check_exchange(drawn: list[Event], options: int, number: int, request: Request) -> None:
-    if options ** len(drawn) > MOST_CELLS >> 4:
+def _check_exchange(here: int, number: int, request: Request) -> None:
+    if here > MOST_CELLS >> 4:
         raise TooManyError(
-            f"one exchange of {request.agents} agents has {_shown(options ** len(drawn))} outcomes, the "
+            f"one exchange of {request.agents} agents has {_shown(here)} outcomes, the "
             f"whole {_shown(number)}, too many to list: use --method optimal or --method monte-carlo, fewer steps or "
             "fewer agents"
         )
@@ -290,7 +293,7 @@ def _ending(
             concerned = [e._replace(receivers=(agent,)) for e in concerning(last, [agent])]
             concerned = last if estimator.joint else concerned
             _check_ending(len(exchanges), len(concerned))
-            possible = outcomes(concerned, request.agents, request.delay, 0, weights)
+            possible = outcomes(concerned, request.agents, 0, weights)
             ids = np.array([[x.fused(agent, o.heard) for o in possible] for x in exchanges])
             factors = weights.factors([o.factor for o in possible], len(concerned))
             share = weights.factors([weights.none()], 0)[0] / len(agents)
@@ -354,7 +357,7 @@ def _last_heard(last: list[Event], request: Request) -> dict[int, list[Any]]:
         degree = max(len(concerning(last, [agent])) for agent in agents)
         for agent in agents:
             concerned = [e._replace(receivers=(agent,)) for e in concerning(last, [agent])]
-            for outcome in outcomes(concerned, request.agents, (1.0,), 0, weights):
+            for outcome in outcomes(concerned, request.agents, 0, weights):
                 shares = found.setdefault(outcome.heard[agent], [None] * len(request.groups))
                 share = weights.completed(weights.factors([outcome.factor], len(concerned))[0], degree)
                 shares[group] = share / len(agents) + (0 if shares[group] is None else shares[group])

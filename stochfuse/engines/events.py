@@ -2,7 +2,8 @@
 
 A step draws independent events: every ordered pair of agents in an ad hoc network, every sender in a broadcast one,
 every agent's one link in a cyclic one.  An event succeeds with probability µ, and everyone it concerns then hears the
-sender, at once or after a delay that is drawn with it.  Sets of agents are masks, bit i for agent i.
+sender, at once or after a delay that is drawn with it.  Between the exchanges of two steps a sensor that may miss
+draws whether it measures (`stochfuse.scenario.system.Detection`).  Sets of agents are masks, bit i for agent i.
 
 Bookkeeping of how likely outcomes are, while they are gone through.
 
@@ -17,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import permutations
+from math import prod
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -24,6 +26,7 @@ import numpy as np
 from stochfuse.errors import UsageError
 from stochfuse.estimators.protocol import Late
 from stochfuse.scenario.network import LinkRows, Network, possible_senders
+from stochfuse.scenario.system import Detection
 
 if TYPE_CHECKING:
     from stochfuse.engines.events import Event, Fate
@@ -34,7 +37,7 @@ MOST_AGENTS_RELABELLED = 7
 
 
 class Event(NamedTuple):
-    """One draw of a step: who sends, who hears it, and with which probability in each row.
+    """One draw of a step: who sends, who hears it, with which probability in each row, and after which delay.
 
     Of a bursty link `probability` is the mean; `burst` (rows, 4) says how it comes about, and `number` which link it is
     among those of every step.
@@ -45,6 +48,7 @@ class Event(NamedTuple):
     probability: np.ndarray
     burst: np.ndarray | None = None
     number: int = 0
+    delay: tuple[float, ...] = (1.0,)
 
 
 class Fate(NamedTuple):
@@ -56,11 +60,20 @@ class Fate(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Which agents each agent hears in a step (itself included), what is under way, and the outcome's factor."""
+    """What becomes of a step.
+
+    Parameters
+    ----------
+    heard : agents that each agent hears, itself included.
+    late : what is under way.
+    factor : the outcome's weight.
+    missed : agents whose sensor misses at the next step.
+    """
 
     heard: tuple[int, ...]
     late: tuple[Late, ...]
     factor: Any
+    missed: int = 0
 
 
 def events(network: Network, rows: LinkRows, step: int) -> list[Event]:
@@ -73,6 +86,7 @@ def events(network: Network, rows: LinkRows, step: int) -> list[Event]:
         found = [Event(j, heard, µ[:, heard[0], place[heard[0], j]]) for j, heard in listeners.items() if heard]
     else:
         found = [Event(int(j), (i,), µ[:, i, p]) for i in range(n) for p, j in enumerate(senders[i])]
+    found = [event._replace(delay=network.delay_of(event.receivers[0], event.sender)) for event in found]
     if rows.bursts is not None:
         return [e._replace(burst=rows.chain(e.probability), number=number) for number, e in enumerate(found)]
     # with one µ for all links the answer is a polynomial in µ, whatever values of µ are asked for
@@ -98,10 +112,15 @@ def relabellings(network: Network, rows: LinkRows, sources: Sequence[int]) -> li
             zip(possible_senders(network.architecture, n), np.moveaxis(rows.matrices(network, step), 1, 0), strict=True)
         ):
             link[k][:, i, senders] = µ + 1.0  # told apart from a link that does not exist
+    delays = np.zeros((n, n, 0)) if network.delays is None else np.array(network.delays)
     found = []
     for p in permutations(range(n)):
         order = list(p)
-        if all(sources[a] == sources[i] for i, a in enumerate(p)) and (link == link[..., order, :][..., order]).all():
+        if (
+            all(sources[a] == sources[i] for i, a in enumerate(p))
+            and (link == link[..., order, :][..., order]).all()
+            and (delays == delays[order][:, order]).all()
+        ):
             found.append(p)
     return found
 
@@ -116,18 +135,20 @@ def orbits(n: int, permutations: Sequence[tuple[int, ...]]) -> list[tuple[int, .
     return [tuple(i for i in range(n) if group[i] == g) for g in sorted(set(group))]
 
 
-def outcomes(drawn: Sequence[Event], agents: int, delay: Sequence[float], left: int, weights: Weights) -> list[Outcome]:
+def outcomes(
+    drawn: Sequence[Event], agents: int, left: int, weights: Weights, detections: Sequence[Detection] = ()
+) -> list[Outcome]:
     """Every outcome of a step that has a positive probability in some row.
 
     Parameters
     ----------
     drawn : the step's events.
     left : steps left after this one; what arrives later does not matter.
+    detections : draws of what is measured at the next step.
     """
-    choices = fates(delay, left)
     whole = [Outcome(tuple(1 << i for i in range(agents)), (), weights.none())]
     for event in drawn:
-        options = [(fate, weights.factor(event, fate)) for fate in choices]
+        options = [(fate, weights.factor(event, fate)) for fate in fates(event.delay, left)]
         if isinstance(weights, Rows):
             options = [(fate, factor) for fate, factor in options if np.any(factor)]
         whole = [
@@ -139,7 +160,19 @@ def outcomes(drawn: Sequence[Event], agents: int, delay: Sequence[float], left: 
             for outcome in whole
             for fate, factor in options
         ]
+    for agent, p in detections:
+        options = [(mask, weights.chance(q)) for mask, q in ((0, p), (1 << agent, 1.0 - p)) if q > 0]
+        whole = [
+            o._replace(missed=o.missed | mask, factor=weights.both(o.factor, factor))
+            for o in whole
+            for mask, factor in options
+        ]
     return whole
+
+
+def number_of_outcomes(drawn: Sequence[Event], left: int, detections: Sequence[Detection] = ()) -> int:
+    """How many outcomes a step has, likely or not; parameters as of `outcomes`."""
+    return prod(len(fates(event.delay, left)) for event in drawn) << len(detections)
 
 
 def concerning(drawn: Sequence[Event], agents: Sequence[int]) -> list[Event]:
@@ -223,6 +256,10 @@ class CountWeights(_Polynomial):
         """Shift of one event's fate."""
         return 0 if fate.delay is None else self.bits
 
+    def chance(self, probability: float) -> Any:
+        """There is nothing else by chance where outcomes are counted."""
+        raise ValueError("expected coefficients where not all outcomes of as many successes are as likely")
+
     def both(self, a: Any, b: Any) -> Any:
         """Shift of two events together."""
         return a + b
@@ -251,7 +288,7 @@ class CountWeights(_Polynomial):
 
 @dataclass(frozen=True)
 class Coefficients(_Polynomial):
-    """Weights by number of successes, equal µ with delays: coefficients of µ^c (1−µ)^(L−c)."""
+    """Weights by number of successes, equal µ with delays or detections: coefficients of µ^c (1−µ)^(L−c)."""
 
     def one(self) -> np.ndarray:
         """Weight of the start, or of no event."""
@@ -262,6 +299,10 @@ class Coefficients(_Polynomial):
     def factor(self, event: Event, fate: Fate) -> np.ndarray:
         """Coefficients of one event's fate."""
         return np.array([fate.missed, fate.arrived])
+
+    def chance(self, probability: float) -> np.ndarray:
+        """Coefficients of what is as likely whatever µ is."""
+        return np.array([probability])
 
     def both(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Coefficients of two events together."""
@@ -292,6 +333,10 @@ class Rows(_Memoryless):
         """Probabilities of one event's fate."""
         µ = event.probability
         return fate.missed * (1.0 - µ) + fate.arrived * µ
+
+    def chance(self, probability: float) -> np.ndarray:
+        """Probabilities of what is as likely in every row."""
+        return np.full(self.rows, probability)
 
     def both(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Probabilities of two events together."""
@@ -386,9 +431,14 @@ def bursty(drawn: Sequence[Event], rows: int) -> Bursty:
     return Bursty(rows << len(drawn), len(drawn), moves.reshape(len(drawn), rows, 2, 2))
 
 
-def weights_for(network: Network, number_of_events: int) -> Weights:
-    """Return the cheapest exact bookkeeping by number of successes, where all µ are equal."""
-    return CountWeights(number_of_events + 1) if network.delay == (1.0,) else Coefficients()
+def weights_for(network: Network, number_of_events: int, certain: bool = True) -> Weights:
+    """Return the cheapest exact bookkeeping by number of successes, where all µ are equal.
+
+    Parameters
+    ----------
+    certain : whether sensors never miss.
+    """
+    return CountWeights(number_of_events + 1) if certain and network.delay == (1.0,) else Coefficients()
 
 
 def bernstein(coefficients: np.ndarray, degree: int, link: np.ndarray) -> np.ndarray:

@@ -290,7 +290,8 @@ class UnlikeCase:
     ----------
     model, sensors : the model and the kinds of sensors.
     P0, shared : as in `Case`.
-    counts : (outcomes, kinds) how many measurements of each kind are fused, the agent's own included.
+    counts : (outcomes, kinds) how many measurements of each kind are fused, the agent's own included; at step 1 first
+        estimates.
     weights : probability of each outcome at each step, shapes (outcomes, items).
     """
 
@@ -315,7 +316,8 @@ class UnlikeCase:
 
     def start(self) -> Carried:
         items = self.items
-        share = np.ones(items) if self.shared else (self.weights[0] / self.counts.sum(axis=1)[:, None]).sum(axis=0)
+        fused = np.maximum(self.counts.sum(axis=1), 1)  # everybody has a first estimate
+        share = np.ones(items) if self.shared else (self.weights[0] / fused[:, None]).sum(axis=0)
         return Carried(factor(self.P0) * np.sqrt(share)[:, None, None], np.ones(items))
 
     def advance(self, carried: Carried, step: int) -> Carried:

@@ -22,6 +22,7 @@ from stochfuse.engines.events import Event
 from stochfuse.engines.progress import listener, uncollected
 from stochfuse.estimators.protocol import Claims, Estimator, Exchange, Late
 from stochfuse.kalman.kernel import Estimate
+from stochfuse.scenario.system import Detection
 
 BLOCK = 1000
 """Runs drawn from one seed."""
@@ -38,7 +39,7 @@ class Experiment(NamedTuple):
     ----------
     agents : number of agents.
     events : events of every step.
-    delay : probabilities of 0, 1, 2 … steps of delay.
+    detections : draws of what is measured at every step.
     make : makes the estimator, and what to call for its numbers once all runs have been followed.
     of : makes what is kept of every estimate, a named tuple of arrays or Nones, of a stack of estimates.
     runs, seed : size of the sample per row, and its seed.
@@ -46,7 +47,7 @@ class Experiment(NamedTuple):
 
     agents: int
     events: list[list[Event]]
-    delay: tuple[float, ...]
+    detections: list[list[Detection]]
     make: Callable[[], tuple[Estimator, Callable[[], Claims]]]
     of: Callable[[Estimate], Any]
     runs: int
@@ -127,14 +128,18 @@ def run_blocks(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tup
 def _run_blocks(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tuple[Any, np.ndarray]:
     estimator, claims = experiment.make()
     drawn = [_draw(experiment, row, block) for row, block in blocks]
-    runs = sum(len(steps[0]) for steps in drawn)
+    runs = sum(len(fates[0]) for fates, _ in drawn)
     claimed = np.empty((runs, len(experiment.events), experiment.agents), np.int32)
     exchanges, exchange_of = [estimator.exchange(estimator.start())], np.zeros(runs, dtype=np.int64)
     place_of = np.tile(np.arange(experiment.agents), (runs, 1))
     for step in range(1, len(experiment.events) + 1):
         events = experiment.events[step - 1]
-        fates = _moved(np.concatenate([steps[step - 1] for steps in drawn]), events, place_of)
-        different, history_of = _distinct(exchange_of, fates, 1 + len(experiment.delay))
+        fates = _moved(np.concatenate([fates[step - 1] for fates, _ in drawn]), events, place_of)
+        # what is measured at the next step is drawn with what arrives at this one
+        missed = np.concatenate([missed[step] for _, missed in drawn]) if step < len(experiment.events) else None
+        if missed is not None and missed.any():
+            fates = np.concatenate([fates, np.take_along_axis(missed, np.argsort(place_of, axis=1), axis=1)], axis=1)
+        different, history_of = _distinct(exchange_of, fates, 1 + max(len(e.delay) for e in events) if events else 2)
         histories = _Histories(estimator, events, experiment.agents, exchanges, different)
         claimed[:, step - 1] = np.take_along_axis(histories.fused()[history_of], place_of, axis=1)
         if step < len(experiment.events):
@@ -168,7 +173,8 @@ class _Histories:
 
     Parameters
     ----------
-    different : (pairs, 1 + events) number of the exchange and fate of each event, in the order of exchanges.
+    different : (pairs, 1 + events) number of the exchange and fate of each event, in the order of exchanges; where a
+        sensor misses before the next exchange a column more for every agent.
     """
 
     def __init__(
@@ -180,7 +186,8 @@ class _Histories:
         different: np.ndarray,
     ) -> None:
         self.estimator, self.agents = estimator, agents
-        fates = different[:, 1:]
+        fates = different[:, 1 : 1 + len(events)]
+        missed = different[:, 1 + len(events) :] @ (1 << np.arange(different.shape[1] - 1 - len(events)))
         heard = np.tile(1 << np.arange(agents), (len(different), 1))
         late: list[list[Late]] = [[] for _ in range(len(different))]
         for event, fate in zip(events, fates.T, strict=True):
@@ -189,25 +196,25 @@ class _Histories:
                 for pair in np.flatnonzero(fate > 1):
                     late[pair].append(Late(receiver, int(fate[pair]) - 1, event.sender))
         of = [exchanges[exchange] for exchange in different[:, 0]]
-        self.each = list(zip(of, heard.tolist(), late, strict=True))
+        self.each = list(zip(of, heard.tolist(), late, missed.tolist(), strict=True))
 
     def fused(self) -> np.ndarray:
         """What is claimed at every place, (pairs, agents)."""
-        return np.array([[x.fused(i, heard) for i in range(self.agents)] for x, heard, _ in self.each], np.int32)
+        return np.array([[x.fused(i, heard) for i in range(self.agents)] for x, heard, *_ in self.each], np.int32)
 
     def merged(self) -> tuple[list[Exchange], np.ndarray, np.ndarray]:
         """Next exchanges of the different states, each pair's number, and where its agents moved, (pairs, agents)."""
         states: dict[Any, int] = {}
         after, moved = np.empty(len(self.each), dtype=np.int64), np.empty((len(self.each), self.agents), dtype=np.int64)
-        for pair, (exchange, heard, late) in enumerate(self.each):
-            state, order = exchange.after(heard, late)
+        for pair, (exchange, heard, late, missed) in enumerate(self.each):
+            state, order = exchange.after(heard, late, missed)
             after[pair] = states.setdefault(state, len(states))
             moved[pair, order] = range(self.agents)
         return [self.estimator.exchange(state) for state in states], after, moved
 
     def onward(self) -> list[Exchange]:
         """Next exchange of every pair."""
-        return [exchange.onward(heard, late) for exchange, heard, late in self.each]
+        return [exchange.onward(heard, late, missed) for exchange, heard, late, missed in self.each]
 
 
 def _moved(fates: np.ndarray, events: Sequence[Event], place_of: np.ndarray) -> np.ndarray:
@@ -239,12 +246,18 @@ def _runs_of(block: int, runs: int) -> int:
     return min(BLOCK, runs - block * BLOCK)
 
 
-def _draw(experiment: Experiment, row: int, block: int) -> list[np.ndarray]:
-    """Fates of a block's events per step, (runs, events): 0 lost, 1 + delay otherwise."""
+def _draw(experiment: Experiment, row: int, block: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Fates of a block's events per step, (runs, events): 0 lost, 1 + delay otherwise; and which agents' sensors miss
+    at each step, (runs, agents).
+    """
     generator = np.random.default_rng(np.random.SeedSequence(experiment.seed, spawn_key=(row, block)))
-    runs, delays = _runs_of(block, experiment.runs), np.cumsum(experiment.delay)
-    out, bad = [], None
-    for events in experiment.events:
+    runs = _runs_of(block, experiment.runs)
+    out, missing, bad = [], [], None
+    for events, detections in zip(experiment.events, experiment.detections, strict=True):
+        missed = np.zeros((runs, experiment.agents), dtype=np.int64)
+        for agent, p in detections:
+            missed[:, agent] = generator.random(runs) >= p
+        missing.append(missed)
         µ = np.array([event.probability[row] for event in events])
         bursts = [event.burst[row] for event in events if event.burst is not None]
         if bursts:
@@ -253,10 +266,17 @@ def _draw(experiment: Experiment, row: int, block: int) -> list[np.ndarray]:
             bad = generator.random((runs, len(events))) < change
             µ = np.where(bad, bad_µ, good_µ)
         arrived = generator.random((runs, len(events))) < µ
-        late = 0
-        if len(delays) > 1:
-            late = np.minimum(
-                np.searchsorted(delays, generator.random((runs, len(events))), side="right"), len(delays) - 1
-            )
-        out.append(np.where(arrived, 1 + late, 0))
-    return out
+        out.append(np.where(arrived, 1 + _delays(events, runs, generator), 0))
+    return out, missing
+
+
+def _delays(events: Sequence[Event], runs: int, generator: np.random.Generator) -> np.ndarray | int:
+    """Steps that each message takes, (runs, events)."""
+    longest = max((len(event.delay) for event in events), default=1)
+    if longest == 1:
+        return 0
+    drawn, late = generator.random((runs, len(events))), np.empty((runs, len(events)), dtype=np.int64)
+    for place, event in enumerate(events):
+        within = np.searchsorted(np.cumsum(event.delay), drawn[:, place], side="right")
+        late[:, place] = np.minimum(within, len(event.delay) - 1)
+    return late

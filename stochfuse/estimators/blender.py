@@ -35,7 +35,7 @@ class Blender(RecursiveEstimator):
         members = (agent, *self.neighbours(agent, heard))
         return self.pasts.number(step, (BLEND, *members), [values[j] for j in members])
 
-    def onward(self, step: int, agent: int, fused: int, before: int) -> int:
+    def onward(self, step: int, agent: int, fused: int, before: int, missed: bool) -> int:
         """The agent's own filter, into which the blend is not fed back."""
         return self.pasts.number(step + 1, ("local", agent), (before,))
 

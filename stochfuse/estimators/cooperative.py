@@ -75,7 +75,7 @@ class Itns(RecursiveEstimator):
         """Work a batch out."""
         name = rules[0][0]
         if name == JOINT_LOCAL:
-            return self._first() if step == 1 else self._local(step, rests_on[0])
+            return self._first() if step == 1 else self._local(step, rests_on[0], rules[0][1:])
         if name == BLOCK:
             rows = self.world.states[rules[0][1]]
             (joint,) = rests_on
@@ -92,8 +92,8 @@ class Itns(RecursiveEstimator):
         b = np.zeros((len(world.P0), 1)) if world.error is None else world.error
         return Worked(world.P0[None], self._with_columns(1, factor(world.P0)[None], b[None])[0])
 
-    def _local(self, step: int, before: Worked) -> Worked:
-        """Time update of the whole and all local measurements."""
+    def _local(self, step: int, before: Worked, missed: Sequence[int]) -> Worked:
+        """Time update of the whole and all local measurements, but those of agents whose sensor misses."""
         world = self.world
         x, w, v = None, None, None
         if self.errors:
@@ -107,7 +107,7 @@ class Itns(RecursiveEstimator):
         prior = predict(Estimate(x, before.P), world.joint_transition(step), at_step(world.Q, step), w)
         estimate = prior
         for agent, rows in enumerate(world.measurements):
-            if rows.stop > rows.start:
+            if rows.stop > rows.start and agent not in missed:
                 z = None if v is None else v[rows]
                 estimate = itns_update(estimate, world.joint_sensor(agent, step), at_step(world.R[agent], step), z)
         self.grown(prior.P, estimate.P)
@@ -179,6 +179,7 @@ class JointExchange(PastExchange):
         """Value of the agent's block of the joint estimate."""
         return self.estimator.pasts.number(self.state.step, (BLOCK, agent), (self._joint(heard),))
 
-    def _next(self, heard: Sequence[int], late: Sequence[Late]) -> PastState:
-        step = self.state.step + 1
-        return PastState(step, (self.estimator.pasts.number(step, (JOINT_LOCAL,), (self._joint(heard),)),) * len(heard))
+    def _next(self, heard: Sequence[int], late: Sequence[Late], missed: int) -> PastState:
+        step, agents = self.state.step + 1, range(len(heard))
+        rule = (JOINT_LOCAL, *(i for i in agents if missed >> i & 1))
+        return PastState(step, (self.estimator.pasts.number(step, rule, (self._joint(heard),)),) * len(agents))

@@ -26,7 +26,7 @@ from stochfuse.fusion.equivalent import (
 )
 from stochfuse.kalman.kernel import Estimate, at_step, corrected, gain, predict
 
-MEASURED = "measured"
+MEASURED, MISSED = "measured", "missed"
 
 
 class EquivalentMeasurement(RecursiveEstimator):
@@ -51,15 +51,19 @@ class EquivalentMeasurement(RecursiveEstimator):
         """Value of the agent's estimate with all measurements heard."""
         if step == 1:
             return values[agent]
-        rule = self._rules.get((agent, heard))
+        missed = [self.pasts.rule[value][0] == MISSED for value in values]
+        key = (agent, heard & ~sum(1 << j for j, without in enumerate(missed) if without))
+        rule = self._rules.get(key)
         if rule is None:
-            members = [j for j in sorted({agent, *self.neighbours(agent, heard)}) if j in self._sees]
-            rule = self._rules[agent, heard] = (MEASURED, agent, *members)
-        return self.pasts.number(step, rule, (values[agent],))
+            there = {agent, *self.neighbours(agent, heard)}
+            members = [j for j in sorted(there) if j in self._sees and not missed[j]]
+            rule = self._rules[key] = (MEASURED, agent, *members)
+        before = self.pasts.rests_on[values[agent]][0] if missed[agent] else values[agent]
+        return self.pasts.number(step, rule, (before,))
 
-    def onward(self, step: int, agent: int, fused: int, before: int) -> int:
-        """The estimate itself: what is measured next is taken in with what is heard then."""
-        return fused
+    def onward(self, step: int, agent: int, fused: int, before: int, missed: bool) -> int:
+        """The estimate itself: what is measured next, if it is, is taken in with what is heard then."""
+        return self.pasts.number(step + 1, (MISSED, agent), (fused,)) if missed else fused
 
     def first(self, rows: slice) -> Worked:
         """First estimate, with its actual moments."""
@@ -71,8 +75,10 @@ class EquivalentMeasurement(RecursiveEstimator):
 
     def work(self, step: int, rules: Sequence[FusionStep], rests_on: list[Worked]) -> Worked:
         """Time update and one measurement."""
-        _, agent, *members = rules[0]
+        name, agent, *members = rules[0]
         (before,), rows = rests_on, self.world.states[agent]
+        if name == MISSED:  # only says so of the estimate that it rests on
+            return before
         F, Q = at_step(self.world.F[agent], step), at_step(self.world.Q, step)[rows, rows]
         prior = predict(Estimate(before.bias, before.P), F, Q)
         truth = None if before.actual is None else predict(Estimate(None, before.actual), F, Q).P

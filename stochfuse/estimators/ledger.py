@@ -98,18 +98,18 @@ class Ledger(Renamed):
         self._atom_of: dict[tuple[str, int, int], int] = {}
         self._value_of: dict[tuple[int, tuple[tuple[int, int], ...]], int] = {}
         self._prior_of: dict[int, int] = {}
-        self._local_of: dict[tuple[int, int], int] = {}
+        self._local_of: dict[tuple[int, int | None], int] = {}
         super().__init__(kinds, None if kinds is None else Ledger())
 
     def start(self, source: int) -> int:
         """Information of an initial estimate, at step 1."""
         return self._value(1, ((self._atom(START, 1, source), 1),))
 
-    def local(self, value: int, source: int) -> int:
-        """The next step's local estimate: predicted from a fused value, with the source's own measurement."""
+    def local(self, value: int, source: int | None) -> int:
+        """The next step's local estimate: predicted from a fused value, with the source's own measurement if any."""
         known = self._local_of.get((value, source))
         if known is None:
-            known = self._local_of[value, source] = self.measured(value, (source,))
+            known = self._local_of[value, source] = self.measured(value, () if source is None else (source,))
         return known
 
     def measured(self, value: int, sources: Sequence[int]) -> int:

@@ -181,20 +181,24 @@ class GraphExchange:
             self._unions[heard] = known
         return known
 
-    def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[GraphState, tuple[int, ...]]:
+    def after(
+        self, heard: Sequence[int], late: Sequence[Late] = (), missed: int = 0
+    ) -> tuple[GraphState, tuple[int, ...]]:
         """State before the next exchange, in the order that like states share, and the agent at each place of it."""
-        return self._merged(*self._next(heard, late))
+        return self._merged(*self._next(heard, late, missed))
 
-    def onward(self, heard: Sequence[int], late: Sequence[Late] = ()) -> GraphExchange:
+    def onward(self, heard: Sequence[int], late: Sequence[Late] = (), missed: int = 0) -> GraphExchange:
         """Open the next exchange as it comes, with every node kept."""
-        agents, waiting = self._next(heard, late)
+        agents, waiting = self._next(heard, late, missed)
         under_way = [(receiver, left, mask) for (receiver, left), mask in waiting.items()]
         return GraphExchange(self.estimator, self.pedigrees, agents, under_way, keep=True)
 
-    def _next(self, heard: Sequence[int], late: Sequence[Late]) -> tuple[list[Agent], dict[tuple[int, int], int]]:
+    def _next(
+        self, heard: Sequence[int], late: Sequence[Late], missed: int
+    ) -> tuple[list[Agent], dict[tuple[int, int], int]]:
         known = [self.known(i, h) for i, h in enumerate(heard)]
         local, fuse = self.estimator.ledger.local, self.pedigrees.fuse
-        agents = [Agent(local(fuse(mask), s), mask) for s, mask in zip(self.estimator.sources, known, strict=True)]
+        agents = [Agent(local(fuse(mask), s), mask) for s, mask in zip(self.estimator.seen(missed), known, strict=True)]
         waiting: dict[tuple[int, int], int] = {}
         if late or self.late:
             under_way = [(r, left - 1, mask) for r, left, mask in self.late if left > 0]

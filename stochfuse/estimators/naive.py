@@ -67,19 +67,25 @@ class NaiveExchange:
         terms = [(self.union(heard[agent]), 1), *((value, 1) for value in self._due[agent])]
         return self.estimator.ledger.combine(self._step, terms)
 
-    def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[NaiveState, tuple[int, ...]]:
+    def after(
+        self, heard: Sequence[int], late: Sequence[Late] = (), missed: int = 0
+    ) -> tuple[NaiveState, tuple[int, ...]]:
         """State before the next exchange, in the order that like states share, and the agent at each place of it."""
         estimator = self.estimator
-        agents, under_way, order = in_least_order(estimator.ledger, *self._next(heard, late), estimator.relabellings)
+        agents, under_way, order = in_least_order(
+            estimator.ledger, *self._next(heard, late, missed), estimator.relabellings
+        )
         return NaiveState(agents, under_way), order
 
-    def onward(self, heard: Sequence[int], late: Sequence[Late] = ()) -> NaiveExchange:
+    def onward(self, heard: Sequence[int], late: Sequence[Late] = (), missed: int = 0) -> NaiveExchange:
         """Open the next exchange as it comes."""
-        agents, under_way = self._next(heard, late)
+        agents, under_way = self._next(heard, late, missed)
         return NaiveExchange(self.estimator, NaiveState(tuple(agents), tuple(under_way)))
 
-    def _next(self, heard: Sequence[int], late: Sequence[Late]) -> tuple[list[int], list[tuple[int, int, int]]]:
-        ledger, sources = self.estimator.ledger, self.estimator.sources
+    def _next(
+        self, heard: Sequence[int], late: Sequence[Late], missed: int
+    ) -> tuple[list[int], list[tuple[int, int, int]]]:
+        ledger, sources = self.estimator.ledger, self.estimator.seen(missed)
         agents = [ledger.local(self.fused(i, heard), source) for i, source in enumerate(sources)]
         under_way = [(r, left - 1, value) for r, left, value in self.state.late if left > 0]
         under_way += [(m.receiver, m.delay - 1, self.state.agents[m.sender]) for m in late]

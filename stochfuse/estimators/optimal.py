@@ -83,20 +83,22 @@ class OptimalExchange:
         """Value that an agent would claim after hearing some agents, with what else is due."""
         return self.estimator.value(self.held(agent, heard[agent]))
 
-    def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[KnownSets, tuple[int, ...]]:
+    def after(
+        self, heard: Sequence[int], late: Sequence[Late] = (), missed: int = 0
+    ) -> tuple[KnownSets, tuple[int, ...]]:
         """State before the next exchange, in the order that like states share, and the agent at each place of it."""
-        state = self._next(heard, late)
+        state = self._next(heard, late, missed)
         counts = [tuple(mask.bit_count() for mask in held) for held in state.agents]
         return min((_moved(state, order), order) for order in best_relabelling(counts, self.estimator.relabellings))
 
-    def onward(self, heard: Sequence[int], late: Sequence[Late] = ()) -> OptimalExchange:
+    def onward(self, heard: Sequence[int], late: Sequence[Late] = (), missed: int = 0) -> OptimalExchange:
         """Open the next exchange as it comes."""
-        return OptimalExchange(self.estimator, self._next(heard, late))
+        return OptimalExchange(self.estimator, self._next(heard, late, missed))
 
-    def _next(self, heard: Sequence[int], late: Sequence[Late]) -> KnownSets:
+    def _next(self, heard: Sequence[int], late: Sequence[Late], missed: int) -> KnownSets:
         under_way = [(r, left - 1, held) for r, left, held in self.state.late if left > 0]
         under_way += [(m.receiver, m.delay - 1, self.state.agents[m.sender]) for m in late]
-        agents = tuple((*self.held(i, h), 1 << i) for i, h in enumerate(heard))
+        agents = tuple((*self.held(i, h), 1 << i & ~missed) for i, h in enumerate(heard))
         return KnownSets(agents, tuple(sorted(under_way)))
 
 

@@ -11,7 +11,7 @@ write them into a `Ledger`; all others remember pasts, see `stochfuse.estimators
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -38,14 +38,18 @@ class Exchange(Protocol):
         """
         ...
 
-    def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[Hashable, tuple[int, ...]]:
+    def after(
+        self, heard: Sequence[int], late: Sequence[Late] = (), missed: int = 0
+    ) -> tuple[Hashable, tuple[int, ...]]:
         """State before the next exchange, equal for all that will behave alike from here on.
+
+        The sensors of some agents, a mask, miss in between: these predict only.
 
         Like agents may change places for that: returned with it is the agent that took each place.
         """
         ...
 
-    def onward(self, heard: Sequence[int], late: Sequence[Late] = ()) -> Exchange:
+    def onward(self, heard: Sequence[int], late: Sequence[Late] = (), missed: int = 0) -> Exchange:
         """Open the next exchange, nothing merged and nobody moved."""
         ...
 
@@ -152,6 +156,10 @@ class FusionRule:
     ) -> None:
         self.ledger, self.sources, self.shared = ledger, tuple(sources), shared
         self.relabellings = relabellings or [tuple(range(len(self.sources)))]
+
+    def seen(self, missed: int) -> Iterator[int | None]:
+        """Source of what each agent measures; None for those, a mask, whose sensor misses."""
+        return (None if missed >> i & 1 else source for i, source in enumerate(self.sources))
 
 
 def in_least_order(

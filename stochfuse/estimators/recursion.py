@@ -128,9 +128,14 @@ class RecursiveEstimator:
             self._neighbours[agent, heard] = known
         return known
 
-    def onward(self, step: int, agent: int, fused: int, before: int) -> int:
-        """What an agent has at the next step, of what it claims now and had before the exchange."""
-        return self.pasts.number(step + 1, ("local", self.labels[agent]), (fused,))
+    def onward(self, step: int, agent: int, fused: int, before: int, missed: bool) -> int:
+        """What an agent has at the next step, of what it claims now and had before the exchange.
+
+        Parameters
+        ----------
+        missed : whether its sensor misses there.
+        """
+        return self.pasts.number(step + 1, ("forward" if missed else "local", self.labels[agent]), (fused,))
 
     def work(self, step: int, rules: Sequence[FusionStep], rests_on: list[Worked]) -> Worked:
         """Work a batch out, from stacks of what it rests on; all have one rule unless its name is in `mixed`."""
@@ -198,21 +203,26 @@ class PastExchange:
             self._fused[agent, heard[agent]] = known
         return known
 
-    def after(self, heard: Sequence[int], late: Sequence[Late] = ()) -> tuple[PastState, tuple[int, ...]]:
+    def after(
+        self, heard: Sequence[int], late: Sequence[Late] = (), missed: int = 0
+    ) -> tuple[PastState, tuple[int, ...]]:
         """State before the next exchange, in the order that like states share, and the agent at each place of it."""
         estimator = self.estimator
-        step, agents, coming = self._next(heard, late)
+        step, agents, coming = self._next(heard, late, missed)
         agents, under_way, order = in_least_order(estimator.pasts, agents, coming, estimator.relabellings)
         return PastState(step, agents, under_way), order
 
-    def onward(self, heard: Sequence[int], late: Sequence[Late] = ()) -> PastExchange:
+    def onward(self, heard: Sequence[int], late: Sequence[Late] = (), missed: int = 0) -> PastExchange:
         """Open the next exchange as it comes."""
-        return self.estimator.exchange(self._next(heard, late))
+        return self.estimator.exchange(self._next(heard, late, missed))
 
-    def _next(self, heard: Sequence[int], late: Sequence[Late]) -> PastState:
+    def _next(self, heard: Sequence[int], late: Sequence[Late], missed: int) -> PastState:
         step, before, under_way = self.state
         estimator = self.estimator
-        agents = tuple(estimator.onward(step, i, self.fused(i, heard), value) for i, value in enumerate(before))
+        agents = tuple(
+            estimator.onward(step, i, self.fused(i, heard), value, bool(missed >> i & 1))
+            for i, value in enumerate(before)
+        )
         coming = [(r, left - 1, value) for r, left, value in under_way if left > 0]
         coming += [(m.receiver, m.delay - 1, before[m.sender]) for m in late]
         forward = [

@@ -13,6 +13,9 @@ Up to a hundred senders the sums are evaluated as they stand.  For more like sen
 
 and a fixed double-exponential rule gives them to rounding, at a cost that does not depend on N, without a binomial
 coefficient that could overflow and exactly at µ = 0 and µ = 1.
+
+Where the agent's own sensor may miss, as those of the senders, the number n of measurements takes the place of m + 1,
+and may be 0: nothing is gained then.
 """
 
 from __future__ import annotations
@@ -62,14 +65,21 @@ class Counts:
 
     Parameters
     ----------
-    weights : (N + 1, items) probability of m = 0 … N arrivals.
+    weights : (N + 1, items) probability of m = 0 … N arrivals, that is of m + 1 measurements.
+    nothing : (items,) probability of no measurement at all; or 0.
     """
 
     weights: np.ndarray
+    nothing: np.ndarray | float = 0.0
+
+    @classmethod
+    def of_measurements(cls, pmf: np.ndarray) -> Counts:
+        """Return the distribution of 0, 1, 2 … measurements, (numbers, items)."""
+        return cls(pmf[1:], pmf[0])
 
     def remaining(self, s: np.ndarray) -> np.ndarray:
         """E(s)."""
-        return self._average(s, self.weights)
+        return self._average(s, self.weights) + self.nothing
 
     def gained(self, s: np.ndarray) -> np.ndarray:
         """g(s)."""
@@ -81,7 +91,8 @@ class Counts:
 
     def take(self, items: np.ndarray | slice) -> Counts:
         """Return the distributions of some items."""
-        return Counts(self.weights[:, items])
+        nothing = self.nothing[items] if isinstance(self.nothing, np.ndarray) else self.nothing
+        return Counts(self.weights[:, items], nothing)
 
     @cached_property
     def _gains(self) -> np.ndarray:
@@ -162,14 +173,20 @@ class Binomial:
         return total / rate
 
 
-def like_senders(senders: int, link: np.ndarray) -> Arrivals:
+def like_senders(senders: int, link: np.ndarray, detection: float = 1.0) -> Arrivals:
     """Distribution of arrivals from N senders that are heard with the same probability, thesis (50).
 
     Parameters
     ----------
     senders : N ≥ 0.
     link : (items,) probability µ of each item.
+    detection : probability that a sensor measures, the agent's own or a sender's.
     """
+    if detection < 1.0:
+        heard = _binomial(senders, link * detection)
+        nobody = np.zeros((1, len(link)))
+        own = np.concatenate([nobody, detection * heard])
+        return Counts.of_measurements(own + np.concatenate([(1.0 - detection) * heard, nobody]))
     if senders > SUM_UP_TO:
         return Binomial(senders, link)
     weights = np.ones((senders + 1, len(link)))
@@ -180,6 +197,16 @@ def like_senders(senders: int, link: np.ndarray) -> Arrivals:
         weights[m] *= float(comb(senders, m)) * heard
         weights[senders - m] *= missed
     return Counts(weights / weights.sum(axis=0))
+
+
+def _binomial(N: int, p: np.ndarray) -> np.ndarray:
+    """Binomial distribution, (N + 1, items), for any N."""
+    from scipy.special import gammaln, xlog1py, xlogy
+
+    m = np.arange(N + 1.0)[:, None]
+    ways = gammaln(N + 1.0) - gammaln(m + 1.0) - gammaln(N - m + 1.0)
+    pmf = np.exp(ways + xlogy(m, p) + xlog1py(N - m, -p))
+    return pmf / pmf.sum(axis=0)
 
 
 def poisson_binomial(link: np.ndarray) -> np.ndarray:

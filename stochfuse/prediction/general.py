@@ -576,18 +576,18 @@ def _enumerated(
     elif how.prune or _common(system, links) is None:
         weights = Rows(len(links.link))
     else:
-        weights = weights_for(network, sum(map(len, per_step)))
+        weights = weights_for(network, sum(map(len, per_step)), system.detects is None)
     groups = groups_alike(network, links, kinds, permutations)
     request = Request(
         agents=network.agents,
         steps=network.steps,
-        delay=network.delay,
         events=lambda step: per_step[step - 1],
         weights=weights,
         groups=groups,
         most=how.max_graphs,
         prune=how.prune,
         plain=plain,
+        detections=system.detections,
     )
     return Enumerated(groups, enumerate_outcomes(made.estimator, request), made, weights)
 
@@ -702,7 +702,7 @@ def groups_alike(
     network: Network, rows: LinkRows, labels: Sequence[int], permutations: Sequence[tuple[int, ...]]
 ) -> tuple[tuple[int, ...], ...]:
     """Groups of agents that some relabelling takes into one another; of too many to look, all or none."""
-    if network.agents > MOST_AGENTS_RELABELLED and rows.uniform and len(set(labels)) == 1:
+    if network.agents > MOST_AGENTS_RELABELLED and rows.uniform and len(set(labels)) == 1 and network.delays is None:
         return (tuple(range(network.agents)),)
     return tuple(orbits(network.agents, permutations))
 

@@ -53,7 +53,7 @@ def averaged(system: System, items: Items, how: Settings, errors: bool) -> Avera
     """
     links, network = items.links, system.network
     groups = groups_of(system, links)
-    chain = contacts(network, links, system.sensor_of, groups)
+    chain = contacts(network, links, system.sensor_of, groups, system.detects)
     paths = number_of_paths(network) if counted(system, links) else None
     try:
         if paths is not None:
@@ -155,11 +155,12 @@ def filter_of(system: System) -> LosslessFilter:
 
 def counted(system: System, links: LinkRows) -> bool:
     """Whether `number_of_paths` is that of the system's chain."""
-    return _alike(system, links) and system.network.delay == (1.0,) and links.bursts is None
+    plain = system.network.delay == (1.0,) and links.bursts is None and system.detects is None
+    return plain and _alike(system, links)
 
 
 def _alike(system: System, links: LinkRows) -> bool:
-    return len(set(system.sensor_of)) == 1 and links.uniform
+    return len(set(system.sensor_of)) == 1 and links.uniform and system.network.delays is None
 
 
 def _paths_of(system: System, chain: Contacts) -> int:

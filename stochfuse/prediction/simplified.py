@@ -21,6 +21,8 @@ Departures from the source
 * Erratum 2: (52) counts m − 1 common terms because its m counts all sets; (53)/(54) count received sets.
 * Unequal links µ_ij(k): the number of arrivals is Poisson-binomial.  Unlike agents: agent i averages over the sets S of
   senders, P_S⁻¹ = P_i⁻¹(k|k−1) + J_i + Σ_{j∈S} J_j, summed here by how many of each kind of sensor arrive.
+* Sensors that may miss: measurements arrive, not messages, so that µ_ij becomes µ_ij p_j and the agent's own is one
+  more that arrives with p_i; no measurement at all leaves the prediction.
 * Cyclic and masked networks: the same recursion with the true number of possible senders, an approximation outside the
   derivation (`departures` says so).
 """
@@ -38,7 +40,7 @@ from stochfuse.engines.mean_field import Case, UnlikeCase, run, run_like
 from stochfuse.engines.precision import definite, ill_noise, lost, rounding, told
 from stochfuse.errors import UsageError
 from stochfuse.kalman.algebra import NUMPY, Algebra, inverse
-from stochfuse.kalman.arrivals import Counts, like_senders, poisson_binomial
+from stochfuse.kalman.arrivals import Arrivals, Counts, like_senders, poisson_binomial
 from stochfuse.kalman.averaged_update import noise_factor, sound
 from stochfuse.kalman.checks import first_fault
 from stochfuse.kalman.kernel import Estimate, from_information, to_information, update, update_information
@@ -282,20 +284,43 @@ def groups(system: System, items: Items) -> list[LikeAgents]:
     shared = system.shared
     if _one_case(system, rows):
         return [LikeAgents((tuple(range(network.agents)),), like_case(system, rows, items.noises))]
-    matrices = dict(zip(steps, _per_step(rows, network.steps, lambda k: rows.matrices(network, k)), strict=True))
-    kinds = np.asarray(system.sensor_of)
-    senders_of = possible_senders(network.architecture, network.agents)
+    kinds, senders_of = np.asarray(system.sensor_of), measuring(system)
+    per_step = _per_step(system, rows, lambda step: measured(system, rows, step))
+    matrices = dict(zip(steps, per_step, strict=True))
     return [
         _group(system, shared, np.flatnonzero(kinds == own), own, kinds[senders_of], matrices)
         for own in range(len(system.sensors))
     ]
 
 
+def measuring(system: System) -> np.ndarray:
+    """Whose measurement may arrive at each agent, (agents, senders): its own among them where sensors may miss."""
+    senders_of = possible_senders(system.network.architecture, system.agents)
+    if system.detects is None:
+        return senders_of
+    return np.concatenate([senders_of, np.arange(system.agents)[:, None]], axis=1)
+
+
+def measured(system: System, rows: LinkRows, step: int) -> np.ndarray:
+    """How likely each of these measurements arrives at a step, (rows, agents, senders)."""
+    heard = rows.matrices(system.network, step)
+    if system.detects is None:
+        return heard
+    p = system.detects[step - 1, list(system.sensor_of)]
+    here = np.concatenate([heard, np.ones((*heard.shape[:2], 1))], axis=2)
+    return here * p[measuring(system)]
+
+
 def like_case(system: System, rows: LinkRows, noises: Noises) -> Case:
     """Like agents with equally likely links, and the noises of the items' own where there are any."""
     network = system.network
     senders = number_of_senders(network.architecture, network.agents)
-    arrivals = _per_step(rows, network.steps, lambda k: like_senders(senders, rows.at_step(k)))
+
+    def of_step(step: int) -> Arrivals:
+        detection = 1.0 if system.detects is None else float(system.detects[step - 1, 0])
+        return like_senders(senders, rows.at_step(step), detection)
+
+    arrivals = _per_step(system, rows, of_step)
     shared = system.shared
     return Case(system.model, system.sensors[0], system.P0, shared, arrivals, len(rows.link), noises)
 
@@ -327,7 +352,8 @@ def _group(
     _, first, column_of = np.unique(signature, axis=0, return_index=True, return_inverse=True)
     members = tuple(tuple(agents[column_of.ravel() == c].tolist()) for c in range(len(first)))
     if len(system.sensors) == 1:
-        tables = {id(h): Counts(_items(poisson_binomial(np.moveaxis(h[:, first], -1, 0)))) for h in by_step}
+        counts = Counts if system.detects is None else Counts.of_measurements
+        tables = {id(h): counts(_items(poisson_binomial(np.moveaxis(h[:, first], -1, 0)))) for h in by_step}
         arrivals = [tables[id(h)] for h in by_step]
         items = by_step[0].shape[0] * len(first)
         return LikeAgents(members, Case(system.model, system.sensors[0], system.P0, shared, arrivals, items))
@@ -363,8 +389,9 @@ def _outcomes(system: System, shared: bool, own: int, sender_kinds: np.ndarray, 
         if id(h) not in seen:
             seen[id(h)] = _outcome_weights(h, sender_kinds, counts, kinds)
         weights.append(seen[id(h)])
-    own_measurement = np.eye(len(kinds), dtype=int)[own]
-    return UnlikeCase(system.model, system.sensors, system.P0, shared, counts + own_measurement, weights)
+    if system.detects is None:
+        counts = counts + np.eye(len(kinds), dtype=int)[own]
+    return UnlikeCase(system.model, system.sensors, system.P0, shared, counts, weights)
 
 
 def _outcome_weights(heard: np.ndarray, sender_kinds: np.ndarray, counts: np.ndarray, kinds: range) -> np.ndarray:
@@ -376,8 +403,14 @@ def _outcome_weights(heard: np.ndarray, sender_kinds: np.ndarray, counts: np.nda
     return _items(weights)
 
 
-def _per_step(rows: LinkRows, steps: int, make: Any) -> list[Any]:
-    """One object per step, and the same object at every step where the links do not vary."""
-    if not rows.varies:
-        return [make(1)] * steps
-    return [make(step) for step in range(1, steps + 1)]
+def _per_step(system: System, rows: LinkRows, make: Any) -> list[Any]:
+    """One object per step, and the same object at steps where neither links nor detections differ."""
+    steps, detects = range(1, system.steps + 1), system.detects
+    if rows.varies:
+        return [make(step) for step in steps]
+    made: dict[bytes, Any] = {}
+    alike = [b"" if detects is None else detects[step - 1].tobytes() for step in steps]
+    for step, key in zip(steps, alike, strict=True):
+        if key not in made:
+            made[key] = make(step)
+    return [made[key] for key in alike]

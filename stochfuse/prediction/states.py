@@ -37,7 +37,7 @@ from stochfuse.prediction import simplified
 from stochfuse.prediction.method import Averaged
 from stochfuse.prediction.result import brief
 from stochfuse.scenario.model import Sensor
-from stochfuse.scenario.network import LinkRows, possible_senders
+from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario
 from stochfuse.scenario.system import Items, System
 
@@ -211,17 +211,17 @@ def _own_records(system: System, rows: LinkRows, z: Sequence[Sequence[np.ndarray
             f"got {network.agents}. Give one record of shape (steps, p)"
         )
     P, group_of = _covariances(system, rows)
-    senders = possible_senders(network.architecture, network.agents)
+    senders = simplified.measuring(system)
     x = [np.broadcast_to(system.x0, (len(rows.link), d, 1))] * network.agents
     out = [np.stack(x, axis=1)]
     for step in range(2, network.steps + 1):
-        heard = rows.matrices(network, step)
+        heard = simplified.measured(system, rows, step)
         kinds = [sensor.at(step) for sensor in system.sensors]
         sensors = [(kinds[kind].H, kinds[kind].R) for kind in system.sensor_of]
         x = [
             _over_subsets(
                 _prior(system, x[i], P[:, step - 2, group_of[i]], step),
-                i,
+                () if system.detects is not None else (i,),
                 senders[i],
                 heard[:, i],
                 sensors,
@@ -235,7 +235,7 @@ def _own_records(system: System, rows: LinkRows, z: Sequence[Sequence[np.ndarray
 
 def _over_subsets(
     prior: Estimate,
-    own: int,
+    certain: Sequence[int],
     senders: np.ndarray,
     heard: np.ndarray,
     sensors: list[tuple[np.ndarray, np.ndarray]],
@@ -246,7 +246,7 @@ def _over_subsets(
     for subset in chain.from_iterable(combinations(places, m) for m in range(len(senders) + 1)):
         inside = np.isin(places, subset)
         x, L = prior.x, start
-        for j in (own, *senders[inside]):
+        for j in (*certain, *senders[inside]):
             # one measurement after the other, so that precise sensors lose nothing
             H, R = sensors[j]
             L = update_factor(L, H, R)

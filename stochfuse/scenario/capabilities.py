@@ -91,6 +91,7 @@ def _varies(system: System) -> bool:
 FEATURES = (
     Feature("no-sensor", "[[agent]] sensor = false", lambda s, _: any(_blind(s)[k] for k in s.sensor_of)),
     Feature("sensor-pauses", "[[agent]] H of zeros in some steps", lambda s, _: _at_times(s)),
+    Feature("detection", "[[agent]] sensor.detection", lambda s, _: s.detects is not None),
     Feature("unlike-noises", "[[agent]] R", lambda s, _: len(s.sensors) > 1 and not _unlike(s)),
     Feature("unlike-sensors", "[[agent]] H", lambda s, _: _unlike(s)),
     Feature("matrices-per-step", "model.F, Q, H, R per step", lambda s, _: _varies(s)),
@@ -99,6 +100,7 @@ FEATURES = (
     Feature("masks", "network.hears", lambda s, _: s.network.hears is not None),
     Feature("cases", "[[network.case]]", lambda s, r: r.names is not None),
     Feature("delay", "network.delay", lambda s, _: s.network.delay != (1.0,)),
+    Feature("unequal-delays", "network.delay as a matrix", lambda s, _: s.network.delays is not None),
     Feature("bursts", "network.burst", lambda s, r: r.bursts is not None),
     Feature("shared-start", 'initial.correlation = "shared"', lambda s, _: s.shared),
     Feature("initial-error", "initial.error", lambda s, _: s.error is not None),
@@ -140,6 +142,7 @@ def _by(*engines: str) -> Callable[[str, str], bool]:
 _SUMS = [e.name for e in registry.ESTIMATOR if e.sums]
 _WEIGHING = [e.name for e in registry.ESTIMATOR if e.weighs]
 _EQUIVALENT = [e.name for e in registry.ESTIMATOR if e.place[0] == "equivalent"]
+_BLENDING = [e.name for e in registry.ESTIMATOR if e.place[0] == "blender"]
 _PROMPT = [e.name for e in registry.ESTIMATOR if not e.sums and not e.weighs]
 RULES = (
     Rule(
@@ -175,6 +178,13 @@ RULES = (
     Rule("estimator {estimator}", _of(registry.OPTIMAL), ("correlated-noises", "disturbance"), _INDEPENDENT),
     Rule("estimator {estimator}", _of(*_PROMPT), ("delay",), _NO_DELAY),
     Rule("estimator {estimator}", _of(*_WEIGHING), ("delay",), _NO_DELAY + " beside model.own", beside="own-states"),
+    Rule(
+        "estimator {estimator}",
+        _of(*_BLENDING),
+        ("detection",),
+        "the joint covariance of all filters is known beforehand only if sensors never miss: expected "
+        "sensor.detection = 1",
+    ),
     Rule(
         "estimator {estimator}",
         _of(*_SUMS),

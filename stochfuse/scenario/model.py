@@ -34,13 +34,20 @@ def once(M: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """What an agent measures: H (p, d) and R (p, p), each constant or with a leading step axis."""
+    """What an agent measures.
+
+    Parameters
+    ----------
+    H, R : (p, d) and (p, p), each constant or with a leading step axis.
+    detection : probability that it measures anything at a step, () or (steps,); None where that is certain.
+    """
 
     H: np.ndarray
     R: np.ndarray
+    detection: np.ndarray | None = None
 
     def at(self, step: int) -> Sensor:
-        """Return what it measures at a step."""
+        """Return what it measures at a step, if it measures."""
         return Sensor(at_step(self.H, step), at_step(self.R, step))
 
     @property

@@ -34,7 +34,8 @@ class Network:
     architecture : one of `ARCHITECTURES`.
     link : probability of shape (), (n, n), (steps,) or (steps, n, n); None where it is to be tabulated.
     cases : named alternatives to `link`.
-    delay : probabilities of a delay of 0, 1, 2 … steps.
+    delay : probabilities of a delay of 0, 1, 2 … steps; of unequal delays the longest are told by its length.
+    delays : the same from each sender to each receiver, by (receiver, sender); None where all have one.
     burst : (4,) good→bad, bad→good, delivery in good, delivery in bad; None for links without memory.
     case_bursts : the same for each of the cases.
     hears : (n, n) whether agent i may hear agent j, or None where all may hear whom the architecture lets them hear.
@@ -49,6 +50,11 @@ class Network:
     burst: np.ndarray | None = None
     case_bursts: tuple[np.ndarray | None, ...] = ()
     hears: np.ndarray | None = None
+    delays: tuple[tuple[tuple[float, ...], ...], ...] | None = None
+
+    def delay_of(self, receiver: int, sender: int) -> tuple[float, ...]:
+        """Probabilities of a delay of 0, 1, 2 … steps of a link."""
+        return self.delay if self.delays is None else self.delays[receiver][sender]
 
 
 @dataclass(frozen=True)

@@ -170,8 +170,10 @@ class NetworkTable(StrictTable):
     hears: list[list[int]] | None = Field(
         None, description="for each agent the agents that it may hear; default: all that the architecture lets it hear"
     )
-    delay: Number | list[Number] | None = Field(
-        None, description="delay of messages in steps, or the probabilities of a delay of 0, 1, 2 … steps"
+    delay: Number | list[Number | list[Number | list[Number]]] | None = Field(
+        None,
+        description="delay of messages in steps, or the probabilities of a delay of 0, 1, 2 … steps; or a matrix "
+        "(row: receiver, column: sender) of either",
     )
     case: list[CaseTable] | None = Field(None, description="named alternatives to link, one row of the table each")
 
@@ -255,7 +257,7 @@ _SHAPES = {
     "matrix": "a number or a matrix (a list of rows), or one such matrix per step",
     "vector": "a number, a list of numbers, or one list per step",
     "link": "a probability, a matrix of them, or one of either per step",
-    "delay": "a number of steps or a list of probabilities",
+    "delay": "a number of steps, a list of probabilities, or a matrix of either",
     "place": "a list of coordinates, or one such list per step",
     "correlation": "a number or a matrix (a list of rows)",
     "disturbance": "a variance, a list of variances, or a matrix (a list of rows)",

@@ -11,7 +11,8 @@ common:
 and the items what they may differ in: link probabilities and noises.  One scenario against many link probabilities is
 the case of one set of noises, a study that of many; there is no other way through the engines.
 
-An agent without a sensor measures nothing: one component with H = 0.  So no engine has to know of it.
+An agent without a sensor measures nothing: one component with H = 0.  So no engine has to know of it.  A sensor that
+may miss is a chance event of its agent and step (`System.detections`), as a link is.
 """
 
 from __future__ import annotations
@@ -29,6 +30,13 @@ from stochfuse.scenario.network import LinkRows, Network
 
 if TYPE_CHECKING:
     from stochfuse.scenario.scenario import Scenario
+
+
+class Detection(NamedTuple):
+    """A draw of a step: whether an agent's sensor measures; or else the agent predicts only."""
+
+    agent: int
+    probability: float
 
 
 class Noises(NamedTuple):
@@ -170,6 +178,29 @@ class System:
         """Whether all agents track the state of one model."""
         return not self.own and not self.filters
 
+    @cached_property
+    def detects(self) -> np.ndarray | None:
+        """Probability that each kind of sensor measures at each step, (steps, kinds); None where all is certain.
+
+        1 where there is nothing to miss: at step 1, without a sensor, and where a sensor pauses.
+        """
+        if all(sensor.detection is None for sensor in self.sensors):
+            return None
+        columns = []
+        for sensor in self.sensors:
+            p = np.broadcast_to(1.0 if sensor.detection is None else sensor.detection, self.steps)
+            columns.append(np.where(sensor.H.any(axis=(-2, -1)), p, 1.0))
+        found = np.stack(columns, axis=1)
+        found[0] = 1.0
+        return None if (found == 1.0).all() else found
+
+    def detections(self, step: int) -> list[Detection]:
+        """Draws of a step's measurements; none of those that are certain."""
+        if self.detects is None or step > self.steps:
+            return []
+        p = self.detects[step - 1]
+        return [Detection(i, float(p[kind])) for i, kind in enumerate(self.sensor_of) if p[kind] < 1.0]
+
     def with_noises(self, noises: Noises) -> System:
         """Return the system with noises of items in the place of its own: for the numbers only.
 
@@ -189,8 +220,9 @@ class System:
         """Return all of it that outcomes, and what agents have in common in each, depend on; equal where that is."""
         network = self.network
         hears = None if network.hears is None else network.hears.tobytes()
-        links = (network.agents, network.steps, network.architecture, network.delay, hears)
-        return (*links, self.labels, self.sensor_of, self.shared)
+        links = (network.agents, network.steps, network.architecture, network.delay, network.delays, hears)
+        detects = None if self.detects is None else self.detects.tobytes()
+        return (*links, self.labels, self.sensor_of, self.shared, detects)
 
 
 def _at_all(M: np.ndarray, steps: int) -> np.ndarray:
@@ -202,7 +234,7 @@ def _seen(sensor: Sensor, steps: int) -> Sensor:
     H, R = sensor.H, sensor.R
     if H.shape[-2] == 0:
         H, R = np.zeros((1, H.shape[-1])), np.eye(1)
-    return Sensor(over_steps(H, steps), over_steps(R, steps))
+    return Sensor(over_steps(H, steps), over_steps(R, steps), sensor.detection)
 
 
 def _labels(scenario: Scenario) -> tuple[int, ...]:

@@ -13,7 +13,7 @@ import numpy as np
 from stochfuse.kalman.checks import shown
 from stochfuse.scenario.checker import Checker
 from stochfuse.scenario.model import Filter, Model, Noise, Sensor
-from stochfuse.scenario.network import ARCHITECTURES, Network, mean_delivery
+from stochfuse.scenario.network import ARCHITECTURES, Network, mean_delivery, possible_senders
 
 MOST_DELAY = 10_000
 """Largest delay of a message, in steps."""
@@ -52,11 +52,11 @@ def read_network(check: Checker, table: Mapping[str, Any]) -> Network | None:
         elif own is not None:
             cases.append((name, own))
             bursts.append(bursty)
-    delay = _delay(check, table.get("delay"))
+    delay, delays = _delays(check, table.get("delay"), agents, architecture)
     hears = _hears(check, table.get("hears"), agents, architecture)
     if hears is not None and any(b is not None for b in (burst, *bursts)):
         check.note("network.hears", "links without memory (no burst)", "a burst")
-    return Network(agents, steps, architecture, link, tuple(cases), delay, burst, tuple(bursts), hears)
+    return Network(agents, steps, architecture, link, tuple(cases), delay, burst, tuple(bursts), hears, delays)
 
 
 def _hears(check: Checker, value: Any, agents: int, architecture: str) -> np.ndarray | None:
@@ -122,22 +122,52 @@ def _check_broadcast(check: Checker, path: str, link: np.ndarray | None, agents:
             )
 
 
-def _delay(check: Checker, value: Any) -> tuple[float, ...]:
-    array = check.array("network.delay", value, "a number of steps or a list of probabilities")
+Delay = tuple[float, ...]
+
+
+def _delays(
+    check: Checker, value: Any, agents: int, architecture: str
+) -> tuple[Delay, tuple[tuple[Delay, ...], ...] | None]:
+    """Read network.delay: what all links have in common, or (mean, by receiver and sender) where they differ."""
+    if not (isinstance(value, list) and any(isinstance(row, list) for row in value)):
+        return _delay(check, "network.delay", value), None
+    if len(value) != agents or any(not isinstance(row, list) or len(row) != agents for row in value):
+        expected = f"a number of steps, probabilities of 0, 1, 2 … steps, or a {agents}×{agents} matrix of either"
+        check.note("network.delay", expected, shown(value))
+        return (1.0,), None
+    found = [
+        [(1.0,) if i == j else _delay(check, f"network.delay[{i + 1}][{j + 1}]", cell) for j, cell in enumerate(row)]
+        for i, row in enumerate(value)
+    ]
+    longest = max(len(delay) for row in found for delay in row)
+    padded = [[delay + (0.0,) * (longest - len(delay)) for delay in row] for row in found]
+    there = [(i, int(j)) for i, senders in enumerate(possible_senders(architecture, agents)) for j in senders]
+    different = {padded[i][j] for i, j in there}
+    if len(different) <= 1:
+        return found[there[0][0]][there[0][1]] if there else (1.0,), None
+    if architecture == "broadcast":
+        uneven = [j for j in range(agents) if len({padded[i][j] for i in range(agents) if i != j}) > 1]
+        if uneven:
+            expected = "equal delays in each column (a broadcast is heard by all at once)"
+            check.note("network.delay", expected, f"unequal ones in column {uneven[0] + 1}")
+    mean = tuple(np.mean([padded[i][j] for i, j in there], axis=0).tolist())
+    return mean, tuple(map(tuple, padded))
+
+
+def _delay(check: Checker, path: str, value: Any) -> Delay:
+    array = check.array(path, value, "a number of steps or a list of probabilities")
     if array is None:
         return (1.0,)
     if array.ndim == 0:
         if array < 0 or array != int(array):
-            check.note(
-                "network.delay", "a whole number of steps, or the probabilities of 0, 1, 2 … steps", shown(value)
-            )
+            check.note(path, "a whole number of steps, or the probabilities of 0, 1, 2 … steps", shown(value))
             return (1.0,)
         if array > MOST_DELAY:
-            check.note("network.delay", f"at most {MOST_DELAY} steps", shown(value))
+            check.note(path, f"at most {MOST_DELAY} steps", shown(value))
             return (1.0,)
         return (0.0,) * int(array) + (1.0,)
     if array.ndim != 1 or not array.size or (array < 0).any() or abs(array.sum() - 1) > 1e-9:
-        check.note("network.delay", "probabilities of 0, 1, 2 … steps that sum to 1", shown(value))
+        check.note(path, "probabilities of 0, 1, 2 … steps that sum to 1", shown(value))
         return (1.0,)
     return tuple(array.tolist())
 

@@ -135,7 +135,7 @@ class GeneralForm:
         ledger = Ledger()
         estimator = rule_of(self.estimator)(ledger, labels, shared=self.shared, relabellings=permutations)
         groups = tuple(orbits(self.agents, permutations))
-        request = Request(self.agents, self.step, (1.0,), lambda _: drawn, weights, groups, most=20_000)
+        request = Request(self.agents, self.step, lambda _: drawn, weights, groups, most=20_000)
         try:
             ending = enumerate_outcomes(estimator, request).endings[-1]
         except TooManyError:

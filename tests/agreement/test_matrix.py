@@ -26,7 +26,7 @@ class Case(NamedTuple):
     link: str = "equal"
     unlike: bool = False
     shared: bool = False
-    delay: tuple[float, ...] = (1.0,)
+    delay: tuple = (1.0,)
 
 
 NETWORKS = {
@@ -39,6 +39,10 @@ NETWORKS = {
     "ad hoc, shared start": Case("ad-hoc", 3, 2, link="sparse", shared=True),
     "ad hoc, delays": Case("ad-hoc", 2, 3, dimension=2, delay=(0.5, 0.3, 0.2)),
     "ad hoc, delays and unequal links": Case("ad-hoc", 2, 3, link="per-step-matrix", delay=(0.0, 1.0)),
+    "ad hoc, unequal delays": Case("ad-hoc", 2, 3, dimension=2, delay=((0, (0.3, 0.5, 0.2)), (1, 0))),
+    "ad hoc, unequal delays and links": Case("ad-hoc", 3, 2, link="sparse", delay=((0, 0, 1), (0, 0, (0.4, 0.6)), (1, 0, 0))),
+    "broadcast, unequal delays": Case("broadcast", 2, 3, delay=((0, (0.3, 0.7)), (0, 0))),
+    "cyclic, unequal delays": Case("cyclic", 3, 2, delay=((0, 1, 0), (0, 0, (0.3, 0.7)), (0, 0, 0))),
     "broadcast": Case("broadcast", 3, 3, dimension=2),
     "broadcast, unlike agents, delays, shared start": Case("broadcast", 2, 3, unlike=True, delay=(0.6, 0.4), shared=True),
     "cyclic": Case("cyclic", 3, 3),
@@ -64,6 +68,18 @@ def links(case, rng):
     return rng.uniform(0, 1, shape).tolist()
 
 
+def plain(delay):
+    """Lists for tuples."""
+    return [plain(each) for each in delay] if isinstance(delay, tuple) else delay
+
+
+def spread(case):
+    """Probabilities of 0, 1 … steps, of every link where they differ."""
+    if isinstance(case.delay[0], float):
+        return case.delay
+    return [[d if isinstance(d, tuple) else (0.0,) * d + (1.0,) for d in row] for row in case.delay]
+
+
 @cache
 def given(name):
     """Scenario, records, and the pieces that the oracle takes."""
@@ -74,7 +90,7 @@ def given(name):
     x0, records = rng.normal(size=(case.dimension, 1)), rng.normal(size=(case.steps, case.agents, 1, 1))
     sensors = [(H, R * (1 + case.unlike * i)) for i in range(case.agents)]
     source = strategies.mapping(
-        F, Q, H, R, P0, case.agents, case.steps, architecture=case.architecture, link=link, delay=list(case.delay)
+        F, Q, H, R, P0, case.agents, case.steps, architecture=case.architecture, link=link, delay=plain(case.delay)
     )
     source["initial"] |= {"x": x0[:, 0].tolist(), "correlation": "shared" if case.shared else "independent"}
     if case.unlike:
@@ -82,7 +98,11 @@ def given(name):
     full = np.array(link)
     full = full[:, None, None] if full.ndim == 1 else full
     full = np.broadcast_to(full, (case.steps, case.agents, case.agents))
-    return case, sf.Scenario.from_mapping(source), (F, Q, sensors, P0, x0, records, case.architecture, full, case.delay)
+    return (
+        case,
+        sf.Scenario.from_mapping(source),
+        (F, Q, sensors, P0, x0, records, case.architecture, full, spread(case)),
+    )
 
 
 @cache

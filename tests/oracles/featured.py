@@ -119,6 +119,12 @@ def _network(**what: Any) -> Callable[[Mapping], None]:
     return lambda made: made["network"].update(what)
 
 
+def _unequal_delays(made: Mapping) -> None:
+    n = made["network"]["agents"]
+    # a broadcast is heard by all at once: equal delays in each column
+    made["network"]["delay"] = [[[0.3, 0.7] if j == 0 and i != j else 0 for j in range(n)] for i in range(n)]
+
+
 def _masks(made: Mapping) -> None:
     n = made["network"]["agents"]
     made["network"]["hears"] = [[j for j in range(1, n + 1) if j != i and i % 2 == 1] for i in range(1, n + 1)]
@@ -142,6 +148,7 @@ _PUT: dict[str, Callable[[Mapping], None]] = {
     "correlated-noises": _noise(correlation=0.3),
     "disturbance": _noise(disturbance=0.5),
     "delay": _network(delay=[0.5, 0.5]),
+    "unequal-delays": _unequal_delays,
     "masks": _masks,
     "broadcast": _network(architecture="broadcast"),
     "cyclic": _network(architecture="cyclic"),

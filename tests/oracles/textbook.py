@@ -223,7 +223,11 @@ class FusionNetwork:
 
 
 def histories(n, steps, architecture, link, delay=(1.0,)):
-    """Every history with its probability: link[k][i][j] from sender j to receiver i at step k + 1."""
+    """Every history with its probability: link[k][i][j] from sender j to receiver i at step k + 1.
+
+    delay: probabilities of 0, 1 … steps, of every link or as delay[i][j].
+    """
+    each = delay if not isinstance(delay[0], float) else [[delay] * n] * n
     draws = []
     for k in range(1, steps + 1):
         if architecture == "ad-hoc":
@@ -233,12 +237,12 @@ def histories(n, steps, architecture, link, delay=(1.0,)):
         else:
             draws += [(k, (i + 1) % n, (i,)) for i in range(n)]
     draws = [(k, j, receivers) for k, j, receivers in draws if receivers and link[k - 1][receivers[0]][j] > 0]
-    fates = [None, *range(len(delay))]
-    for choice in product(fates, repeat=len(draws)):
+    fates = [[None, *range(len(each[receivers[0]][j]))] for _, j, receivers in draws]
+    for choice in product(*fates):
         probability, history = 1.0, [set() for _ in range(steps)]
         for (k, j, receivers), fate in zip(draws, choice, strict=True):
             mu = link[k - 1][receivers[0]][j]
-            probability *= 1 - mu if fate is None else mu * delay[fate]
+            probability *= 1 - mu if fate is None else mu * each[receivers[0]][j][fate]
             if fate is not None and k + fate <= steps:
                 history[k + fate - 1] |= {(j, i, k) for i in receivers}
         if probability > 0:
