@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -39,6 +39,9 @@ from stochfuse.scenario.registry import (
 from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario
 from stochfuse.scenario.system import Items, Noises, System
 
+if TYPE_CHECKING:
+    from stochfuse.prediction.interval import Posterior
+
 COUNTS_AGAIN = "naive fusion counts shared information again and believes it; quantity actual is its true error"
 CENTRE = (
     "what agents measure themselves reaches the centre of ITNS without a link, only agreement between them depends on "
@@ -59,6 +62,7 @@ def predict(
     quantity: str = "claimed",
     *,
     steady: bool = False,
+    interval: float | str | None = None,
     **settings: Any,
 ) -> Prediction:
     """Predict the expected fused covariance against link probability.
@@ -82,6 +86,8 @@ def predict(
         "bias", what is left of the scenario's known initial error (initial.error);
         "rms", the root of the mean squared error, noise and bias.
     steady : also solve for the steady state (simplified).
+    interval : a probability (0.95, "95%"): also what the log behind the scenario's links leaves unknown, see
+        `Prediction.interval`.
     **settings : see `Settings`.
 
     Returns
@@ -108,7 +114,7 @@ def predict(
         and settings.get("estimator") is not None
         and quantity != registry.OPTIMAL
     ):
-        return _by_any(scenario, link, quantity, settings)
+        return _by_any(scenario, link, quantity, {**settings, "interval": interval})
     method, how = _asked(scenario, method, quantity, settings)
     if steady and method != SIMPLIFIED:
         raise UsageError(f"steady: expected method simplified, got {method}")
@@ -120,10 +126,23 @@ def predict(
         item, why = min(found.faults.items())
         raise StochfuseError(f"method {method}: {why} (link probability {rows.means(scenario.network)[item]:g})")
     prediction = _prediction(scenario, rows, method, quantity, found)
+    if interval is not None:
+        prediction = replace(prediction, supported=_supported(scenario, link, interval, method, quantity, settings))
     if not steady:
         return prediction
     fixed = _room("steady_state").steady_state(scenario, rows)
     return prediction.with_steady(fixed.P, fixed.bound)
+
+
+def _supported(
+    scenario: Scenario, link: Any, interval: float | str, method: str, quantity: str, settings: Mapping[str, Any]
+) -> tuple[Posterior, Prediction]:
+    """What the log supports of the links, and the prediction of that."""
+    if link is not None:
+        raise UsageError("interval: expected the scenario's own links, of which packets are counted, got others")
+    room = _room("interval")
+    found = room.posterior(scenario.network, room.level_of(interval), method)
+    return found, predict(scenario, found.rows, method, quantity, **settings)
 
 
 @of_scenario

@@ -17,6 +17,7 @@ from stochfuse.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
     from stochfuse.prediction.general import Outcomes
+    from stochfuse.prediction.interval import Posterior
     from stochfuse.prediction.sampled import Sampled
 
 
@@ -96,6 +97,7 @@ class Prediction(Result):
     meta : further facts for programs.
     steady : (links, groups, d, d) steady-state covariance if it was asked for.
     steady_bound : (links, groups) proved relative error bound of `steady`.
+    supported : link probabilities that the log supports and the prediction of them, if an interval was asked for.
     """
 
     scenario: Scenario
@@ -116,6 +118,7 @@ class Prediction(Result):
     meta: Mapping[str, Any] = field(default_factory=dict)
     steady: np.ndarray | None = None
     steady_bound: np.ndarray | None = field(default=None, repr=False)
+    supported: tuple[Posterior, Prediction] | None = field(default=None, repr=False)
 
     @property
     def by_group(self) -> np.ndarray:
@@ -216,6 +219,24 @@ class Prediction(Result):
             return np.take_along_axis(each, chosen[None], axis=0)[0]
         whom = sum(groups, ()) if agent == "mean" else groups[self._group(agent)]
         return self.sampled.standard_error(m, whom, self.quantity)
+
+    def interval(self, of: str | Metric = "trace", agent: int | str = "mean") -> tuple[np.ndarray, np.ndarray] | None:
+        """Return low and high end of `values`, each (links, steps), as the log supports them; None if not asked for."""
+        if self.supported is None:
+            return None
+        posterior, moved = self.supported
+        ends = posterior.ends(self.values(of, agent)[0], moved.shown_as(self.quantity).values(of, agent))
+        return ends[0][None], ends[1][None]
+
+    def low(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray | None:
+        """Return the low end of `interval`."""
+        ends = self.interval(of, agent)
+        return None if ends is None else ends[0]
+
+    def high(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray | None:
+        """Return the high end of `interval`."""
+        ends = self.interval(of, agent)
+        return None if ends is None else ends[1]
 
     def _group(self, agent: int | str) -> int:
         if isinstance(agent, int | np.integer) and 1 <= agent <= len(self.group_of):

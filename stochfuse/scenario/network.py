@@ -35,6 +35,7 @@ class Network:
     link : probability of shape (), (n, n), (steps,) or (steps, n, n); None where it is to be tabulated.
     cases : named alternatives to `link`.
     delay : probabilities of a delay of 0, 1, 2 … steps; of unequal delays the longest are told by its length.
+    counts : (n, n) packets sent to and received by each agent (receiver, sender), behind `link`; None if not known.
     delays : the same from each sender to each receiver, by (receiver, sender); None where all have one.
     burst : (4,) good→bad, bad→good, delivery in good, delivery in bad; None for links without memory.
     case_bursts : the same for each of the cases.
@@ -51,6 +52,7 @@ class Network:
     case_bursts: tuple[np.ndarray | None, ...] = ()
     hears: np.ndarray | None = None
     delays: tuple[tuple[tuple[float, ...], ...], ...] | None = None
+    counts: tuple[np.ndarray, np.ndarray] | None = None
 
     def delay_of(self, receiver: int, sender: int) -> tuple[float, ...]:
         """Probabilities of a delay of 0, 1, 2 … steps of a link."""

@@ -38,6 +38,7 @@ from stochfuse.scenario.tables import read_filters, read_link, read_model, read_
 
 SCHEMA = "stochfuse.scenario/1"
 DEFAULT = "thesis-transient"
+LINK_KEYS = ("link", "sent", "received", "case", "burst")
 CORRELATIONS = ("independent", "shared")
 _PRESETS = Path(__file__).parent / "presets"
 
@@ -237,7 +238,13 @@ def _with_links(mapping: Any, name: str, folder: Path) -> Any:
             got = f"nothing known of {found.nodes[j]} to {found.nodes[i]}"
             raise ScenarioError(name, [Problem("network.link.file", expected, got)])
         link[i, j] = 0.0
-    return {**mapping, "network": {**network, "agents": n, "nodes": list(found.nodes), "link": link.tolist()}}
+    counted = (
+        {"sent": found.sent.tolist(), "received": found.received.tolist()}
+        if found.sent is not None and found.received is not None
+        else {}
+    )
+    made = {**network, "agents": n, "nodes": list(found.nodes), "link": link.tolist(), **counted}
+    return {**mapping, "network": made}
 
 
 def checked_scenario(source: str | Path) -> Scenario:
@@ -397,7 +404,7 @@ def _override(mapping: dict[str, Any], overrides: Mapping[str, Any]) -> dict[str
     }
     network = mapping.get("network")
     if overrides.get("uniform_link") and isinstance(network, dict):
-        mapping["network"] = {key: value for key, value in network.items() if key not in ("link", "case", "burst")}
+        mapping["network"] = {key: value for key, value in network.items() if key not in LINK_KEYS}
     for key, value in overrides.items():
         if value is None or key == "uniform_link":
             continue

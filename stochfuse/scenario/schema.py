@@ -165,6 +165,10 @@ class NetworkTable(StrictTable):
         description="link probability: a number, a matrix (row: receiver, column: sender), or one of either per step; "
         "or { file = ... }, a packet log; left out, it is tabulated from 0 to 1",
     )
+    sent: list[list[Number]] | None = Field(
+        None, description="packets sent on each link (row: receiver, column: sender), behind link or instead of it"
+    )
+    received: list[list[Number]] | None = Field(None, description="packets of these that were received")
     nodes: list[str] | None = Field(None, description="names of the agents in order: which nodes of a file they are")
     burst: BurstTable | None = Field(None, description="bursty links, instead of a link probability")
     hears: list[list[int]] | None = Field(

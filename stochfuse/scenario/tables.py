@@ -28,7 +28,11 @@ def read_network(check: Checker, table: Mapping[str, Any]) -> Network | None:
         if isinstance(table.get("link"), int | float):
             check.link("network.link", table["link"], 1, 1)
         return None
-    link = read_link(check, "network.link", table.get("link"), agents, steps, architecture)
+    counts = _counts(check, table, agents)
+    given = table.get("link")
+    if counts is not None and given is None:
+        given = _ratios(check, *counts, table.get("hears"))
+    link = read_link(check, "network.link", given, agents, steps, architecture)
     burst = _burst(check, "network", table)
     link = link if burst is None else mean_delivery(burst)
     cases, bursts = [], []
@@ -56,7 +60,38 @@ def read_network(check: Checker, table: Mapping[str, Any]) -> Network | None:
     hears = _hears(check, table.get("hears"), agents, architecture)
     if hears is not None and any(b is not None for b in (burst, *bursts)):
         check.note("network.hears", "links without memory (no burst)", "a burst")
-    return Network(agents, steps, architecture, link, tuple(cases), delay, burst, tuple(bursts), hears, delays)
+    return Network(agents, steps, architecture, link, tuple(cases), delay, burst, tuple(bursts), hears, delays, counts)
+
+
+def _counts(check: Checker, table: Mapping[str, Any], agents: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """Read numbers of packets sent and received, (agents, agents) each."""
+    if table.get("sent") is None and table.get("received") is None:
+        return None
+    found, expected = [], f"a {agents}×{agents} matrix of whole numbers of packets"
+    for key in ("sent", "received"):
+        array = check.array(f"network.{key}", table.get(key), expected) if table.get(key) is not None else None
+        if array is None or array.shape != (agents, agents) or (array < 0).any() or (array != np.rint(array)).any():
+            check.note(f"network.{key}", expected, "nothing" if table.get(key) is None else shown(table[key]))
+        else:
+            found.append(array)
+    if len(found) < 2:
+        return None
+    sent, received = found
+    if (received > sent).any():
+        i, j = np.argwhere(received > sent)[0].tolist()
+        check.note(
+            "network.received", f"at most what was sent, {sent[i, j]:g}", f"{received[i, j]:g} ({i + 1}, {j + 1})"
+        )
+        return None
+    return sent, received
+
+
+def _ratios(check: Checker, sent: np.ndarray, received: np.ndarray, hears: Any) -> list[list[float]]:
+    for i, j in np.argwhere((sent == 0) & ~np.eye(len(sent), dtype=bool)).tolist():
+        if not (isinstance(hears, list) and i < len(hears) and j + 1 not in (hears[i] or [])):
+            check.note(f"network.sent[{i + 1}][{j + 1}]", "packets, or network.hears without this link", "0")
+            break
+    return np.divide(received, sent, out=np.zeros_like(sent), where=sent > 0).tolist()
 
 
 def _hears(check: Checker, value: Any, agents: int, architecture: str) -> np.ndarray | None:
