@@ -34,14 +34,22 @@ def once(M: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """What an agent measures: H (p, d) and R (p, p), each constant or with a leading step axis."""
+    """What an agent measures: H (p, d) and R (p, p), each constant or with a leading step axis.
+
+    Parameters
+    ----------
+    detection : () or (steps,) probability that it measures in a step where H is not zero; None where that is certain.
+    """
 
     H: np.ndarray
     R: np.ndarray
+    detection: np.ndarray | None = None
 
     def at(self, step: int) -> Sensor:
         """Return what it measures at a step."""
-        return Sensor(at_step(self.H, step), at_step(self.R, step))
+        detection = self.detection
+        now = detection if detection is None or detection.ndim == 0 else detection[step - 1]
+        return Sensor(at_step(self.H, step), at_step(self.R, step), now)
 
     @property
     def varies(self) -> bool:
