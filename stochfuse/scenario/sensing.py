@@ -13,8 +13,8 @@ A kind is a stack of these (`KINDS`).  Noise is R = diag(σ²).  Angles are in r
 into [−π, π) (`residual`).
 
 H(k) is H at the nominal path x*(k) of `stochfuse.scenario.motion`, seen from the sensor's own place at step k; v_a(k)
-says how fast it came there from its place at step k − 1.  A sensor measures in step k if k − 1 − offset is a multiple of
-its period, if ρ is at most its range, and if the bearing lies within half its field of view on either side of its
+says how fast it came there from its place at step k − 1.  A sensor measures in step k if k − 1 − offset is a multiple
+of its period, if ρ is at most its range, and if the bearing lies within half its field of view on either side of its
 heading, all of it on the nominal path.  Where it does not measure, H(k) = 0 with R as ever.  At step 1 nothing is
 measured.
 
