@@ -165,7 +165,7 @@ class ModelTable(StrictTable):
         "continuous", description="continuous: white noise all the time; piecewise: one acceleration for each step"
     )
     turn_rate: Series | None = Field(None, description="of a coordinated turn, rad/s from x to y, or one per step")
-    nominal: NominalTable | None = None
+    nominal: NominalTable | None = Field(None, description="where the target is meant to be, for sensors by name")
     sensor: SensorTable | None = Field(None, description="sensor by name in the place of H and R, at every position")
     own: bool = Field(False, strict=True, description="true: every agent has a state of its own, all of this model")
     G: Matrix | None = Field(None, description="process noise gain, default the identity")
