@@ -29,6 +29,8 @@ CHAPTERS = {
     "Parallel filters and blenders": "fusion.parallel",
     "The equivalent measurement": "fusion.equivalent",
     "Cooperative estimators": "fusion.cooperative",
+    "Models by name": "scenario.motion",
+    "Sensors by name": "scenario.sensing",
     "What rounding can do": "engines.precision",
 }
 
@@ -62,7 +64,7 @@ def keys(schema: dict, place: str, definitions: dict) -> list[tuple[str, str]]:
     for name, entry in schema.get("properties", {}).items():
         path = f"{place}.{name}" if place else name
         found.append((f"`{path}`", entry.get("description", entry.get("title", ""))))
-        options = [entry, entry.get("items", {}), *entry.get("anyOf", [])]
+        options = [entry, entry.get("items", {}), *entry.get("anyOf", []), *entry.get("oneOf", [])]
         options += [option.get("items", {}) for option in entry.get("anyOf", [])]
         for option in options:
             inner = definitions.get(option.get("$ref", "").rpartition("/")[2])

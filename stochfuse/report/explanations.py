@@ -47,6 +47,10 @@ TERMS = {
     "ad-hoc": "Every message reaches each agent that could hear it, or not, independently of the others.",
     "broadcast": "A message reaches everyone, or no one.",
     "cyclic": "Agents in a ring: each hears the next one only.",
+    "nominal path": (
+        "Where a target is meant to be at each step, key model.nominal. Sensors by name (range, bearing, …) "
+        "are linearised about it, and see or do not see the target there."
+    ),
     "burst": (
         "A link that remembers: good and bad states with a transition probability each (Gilbert, "
         "Elliott), key network.burst."

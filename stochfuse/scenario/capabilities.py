@@ -90,11 +90,19 @@ def _varies(system: System) -> bool:
 
 FEATURES = (
     Feature("no-sensor", "[[agent]] sensor = false", lambda s, _: any(_blind(s)[k] for k in s.sensor_of)),
-    Feature("sensor-pauses", "[[agent]] H of zeros in some steps", lambda s, _: _at_times(s)),
+    Feature(
+        "sensor-pauses",
+        "[[agent]] H of zeros in some steps, or a sensor's period, range or field_of_view",
+        lambda s, _: _at_times(s),
+    ),
     Feature("detection", "[[agent]] sensor.detection", lambda s, _: s.detects is not None),
     Feature("unlike-noises", "[[agent]] R", lambda s, _: len(s.sensors) > 1 and not _unlike(s)),
     Feature("unlike-sensors", "[[agent]] H", lambda s, _: _unlike(s)),
-    Feature("matrices-per-step", "model.F, Q, H, R per step", lambda s, _: _varies(s)),
+    Feature(
+        "matrices-per-step",
+        "model.F, Q, H, R per step, model.step per step, or a sensor whose H follows the nominal path",
+        lambda s, _: _varies(s),
+    ),
     Feature("unequal-links", "network.link as a matrix", lambda s, r: not r.uniform and s.network.hears is None),
     Feature("links-per-step", "network.link per step", lambda s, r: r.varies),
     Feature("masks", "network.hears", lambda s, _: s.network.hears is not None),

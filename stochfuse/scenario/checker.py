@@ -25,6 +25,11 @@ class Checker:
         """Remember one problem."""
         self.problems.append(Problem(path, expected, got))
 
+    def missing(self, path: str, expected: str) -> None:
+        """Remember that something is not there, unless that is known already."""
+        if path not in self._skip:
+            self.note(path, expected, "nothing")
+
     def array(self, path: str, value: Any, expected: str) -> np.ndarray | None:
         """Any array of finite floats."""
         if value is None or path in self._skip:
@@ -109,6 +114,19 @@ class Checker:
             self.note(path, f"one list for each of the {steps} steps", f"{len(array)} lists")
         else:
             return array[..., None]
+        return None
+
+    def series(self, path: str, value: Any, expected: str, steps: int) -> np.ndarray | None:
+        """Read a number, or one for each step: an array of shape () or (steps,)."""
+        array = self.array(path, value, expected)
+        if array is None:
+            return None
+        if array.ndim > 1:
+            self.note(path, expected, shown(value))
+        elif array.ndim and len(array) < steps:
+            self.note(path, f"one number for each of the {steps} steps", f"{len(array)} numbers")
+        else:
+            return array[:steps] if array.ndim else array
         return None
 
     def integer(self, path: str, value: Any, least: int) -> int | None:

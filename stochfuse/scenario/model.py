@@ -48,7 +48,9 @@ class Sensor:
 
     def at(self, step: int) -> Sensor:
         """Return what it measures at a step, if it measures."""
-        return Sensor(at_step(self.H, step), at_step(self.R, step))
+        detection = self.detection
+        now = detection if detection is None or detection.ndim == 0 else detection[step - 1]
+        return Sensor(at_step(self.H, step), at_step(self.R, step), now)
 
     @property
     def varies(self) -> bool:

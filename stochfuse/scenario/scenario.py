@@ -2,9 +2,10 @@
 
     schema = "stochfuse.scenario/1"
     [model]      F, H, Q, R as nested lists or a number; optional G, B, u; optional states and units (names)
+                 or kind, step, noise (`stochfuse.scenario.motion`), sensor (`stochfuse.scenario.sensing`)
     [initial]    P, correlation = "independent" | "shared", optional x and error (a known initial bias)
     [network]    agents, steps, architecture, link = number | matrix | one of either per step, optional delay, case
-    [[agent]]    optional, for unlike agents: its own H, R
+    [[agent]]    optional, for unlike agents: its own H, R, or a sensor by name at its position
 
 Step 1 holds the agents' initial estimates and the first exchange: nothing is predicted or measured before it (thesis
 3.1).  With correlation = "independent" the initial errors are the agents' own, so that nothing is shared at step 1;
@@ -33,6 +34,7 @@ from stochfuse.scenario.checker import Checker
 from stochfuse.scenario.model import Filter, Model, Noise, Sensor
 from stochfuse.scenario.network import LinkRows, Network, default_rows, restricted, stacked_rows, uniform_rows
 from stochfuse.scenario.registry import ESTIMATORS, GENERAL, METHODS, MONTE_CARLO
+from stochfuse.scenario.sensing import Instrument, by_name, is_named, read_named
 from stochfuse.scenario.system import System
 from stochfuse.scenario.tables import read_filters, read_link, read_model, read_network, read_noise, read_sensors
 
@@ -67,6 +69,9 @@ class Scenario:
     relations : what agent i measures of agent j, by (i, j) counted from 0.
     agent : number of the agent that the scenario asks to be shown, or None.
     method, estimator, runs : what the scenario asks to be predicted by, or None.
+    instruments : each agent's sensor by name, the function that its H is linearised from, None for a sensor without a
+        name; empty where there is none.
+    nominal : (steps, d) states of the nominal path, or None.
     """
 
     name: str
@@ -89,6 +94,8 @@ class Scenario:
     method: str | None = None
     estimator: str | None = None
     runs: int | None = None
+    instruments: tuple[Instrument | None, ...] = ()
+    nominal: np.ndarray | None = None
 
     def __repr__(self) -> str:
         """One line."""
@@ -177,7 +184,8 @@ def load_scenario(source: str | Path | Mapping[str, Any] = DEFAULT, **overrides:
     **overrides : agents, steps, architecture, q, r, p0: numbers that take the place of network.agents, network.steps,
         network.architecture, model.Q, model.R and initial.P; `uniform_link=True` drops the file's link and cases, for a
         caller who gives the link probability.  For a state of several dimensions a number is that multiple of the
-        identity.
+        identity.  Of a model with a kind q is its noise: the density, or the square of the standard deviation; of a
+        sensor by name (model.sensor) r is the square of sigma.
 
     Raises
     ------
@@ -413,8 +421,35 @@ def _override(mapping: dict[str, Any], overrides: Mapping[str, Any]) -> dict[str
             raise TypeError(f"load_scenario() got an unexpected keyword argument '{key}'{near}")
         table, entry = places[key]
         if isinstance(mapping.setdefault(table, {}), dict):
-            mapping[table][entry] = value
+            if table == "model":
+                _override_noise(mapping, entry, value)
+            else:
+                mapping[table][entry] = value
     return mapping
+
+
+def _override_noise(mapping: dict[str, Any], entry: str, value: Any) -> None:
+    """Put a noise covariance in the place of model.Q or R, or of what says it there by name.
+
+    Raises
+    ------
+    UsageError
+        If only agents' own sensors have an R.
+    """
+    model = mapping["model"]
+    if entry == "Q" and model.get("kind") is not None:
+        model["noise"] = _root(value) if model.get("noise_kind") == "piecewise" else value
+    elif entry == "R" and is_named(model.get("sensor")):
+        model["sensor"] = {**model["sensor"], "sigma": _root(value)}
+    elif entry == "R" and "H" not in model and "agent" in mapping and "navigation" not in mapping:
+        raise UsageError("r: expected a sensor of the model (model.R or model.sensor), got agents with their own alone")
+    else:
+        model[entry] = value
+
+
+def _root(variance: Any) -> Any:
+    """Standard deviation of a variance; what is none is left for the reading to refuse."""
+    return variance**0.5 if isinstance(variance, int | float) and variance >= 0 else variance
 
 
 def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> Scenario:
@@ -434,7 +469,8 @@ def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> S
         P0 = check.covariance("initial.P", initial.get("P"), model.dimension if model else None, 0)
     d = model.dimension if model else None
     filters = read_filters(check, agents, model, P0, own, network)
-    sensors, sensor_of = read_sensors(check, agents, default, d, filters, network)
+    named = read_named(check, mapping, model, network, own)
+    sensors, sensor_of = read_sensors(check, agents, default, d, filters, network, named.sensors)
     correlation = check.choice("initial.correlation", initial.get("correlation", "independent"), CORRELATIONS)
     if correlation == "shared" and (own or filters):
         check.note("initial.correlation", '"independent", since agents have states or filters of their own', "'shared'")
@@ -466,6 +502,8 @@ def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> S
         noise=noise,
         process=process,
         relations=relations,
+        instruments=named.instruments(network.agents, agents is None),
+        nominal=named.nominal,
         **shown,
     )
 
@@ -512,7 +550,8 @@ def _relations(
     """What agents measure of each other."""
     agents = mapping.get("agent")
     tables = [table for table in agents if isinstance(table, dict)] if isinstance(agents, list) else []
-    if "cooperative" not in mapping and not any("position" in table for table in tables):
+    placed = not by_name(mapping) and any("position" in table for table in tables)
+    if "cooperative" not in mapping and not placed:
         if own:
             check.note("cooperative", "what agents with states of their own measure of each other", "nothing")
         return {}

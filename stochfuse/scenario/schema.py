@@ -10,10 +10,12 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Strict, Tag, ValidationError
 
 from stochfuse.errors import Problem, nearest
 from stochfuse.kalman.checks import shown
+from stochfuse.scenario.motion import NOISES, ORDERS
+from stochfuse.scenario.sensing import KINDS
 
 Number = Annotated[int, Strict()] | Annotated[float, Strict()]
 
@@ -105,13 +107,69 @@ Matrix = Number | list[list[Number]] | list[list[list[Number]]]
 Link = Number | list[Number | list[Number] | list[list[Number]]]
 
 
+Series = Number | list[Number]
+
+
+class SensorTable(StrictTable):
+    """A sensor by name, at its agent's position, or when that of H and R measures; nothing is measured at step 1."""
+
+    kind: Literal[tuple(KINDS)] | None = Field(  # type: ignore[valid-type]
+        None,
+        description="what it measures of the target: "
+        + ", ".join(KINDS)
+        + "; bearing and azimuth are atan2(Δy, Δx); left out, with all but period, offset and detection: what H says",
+    )
+    sigma: Series | None = Field(None, description="standard deviation in m, m/s or rad, or one for each component")
+    range: Number | None = Field(None, description="beyond this distance on the nominal path it measures nothing, m")
+    field_of_view: Number | None = Field(None, description="full width about heading in which it measures, rad")
+    heading: Series | None = Field(None, description="middle of the field of view, or one per step, rad; default 0")
+    period: int = Field(1, ge=1, strict=True, description="it measures in steps 1 + offset + a multiple of this")
+    offset: int = Field(0, ge=0, strict=True, description="steps by which its period begins later")
+    detection: Series = Field(
+        1.0, description="probability that it measures where it could, or one per step; independent of all else"
+    )
+
+
+def _form(value: Any) -> str:
+    return "table" if isinstance(value, Mapping) else "flag"
+
+
+SensorChoice = Annotated[
+    Annotated[bool, Strict(), Tag("flag")] | Annotated[SensorTable, Tag("table")], Discriminator(_form)
+]
+
+
+class NominalTable(StrictTable):
+    """The path that sensors by name are linearised about: a first state moved on by F, or a place per step."""
+
+    position: Vector = Field(description="coordinates at step 1, or as many per step, m")
+    velocity: Vector | None = Field(
+        None, description="m/s, likewise; default 0, or how fast the places per step follow each other"
+    )
+    acceleration: Vector | None = Field(None, description="m/s², likewise; default 0")
+
+
 class ModelTable(StrictTable):
     """Linear-Gaussian model x(k) = F x(k−1) + B u + G v, z(k) = H x(k) + w, with v ~ N(0, Q), w ~ N(0, R)."""
 
-    F: Matrix = Field(description="state transition, d×d; its size is the number of states")
-    H: Matrix = Field(description="measurement matrix, p×d")
-    Q: Matrix = Field(description="process noise covariance, d×d, or as many as G has columns")
-    R: Matrix = Field(description="measurement noise covariance, p×p, positive definite")
+    F: Matrix | None = Field(None, description="state transition, d×d; its size is the number of states")
+    H: Matrix | None = Field(None, description="measurement matrix, p×d")
+    Q: Matrix | None = Field(None, description="process noise covariance, d×d, or as many as G has columns")
+    R: Matrix | None = Field(None, description="measurement noise covariance, p×p, positive definite")
+    kind: Literal[tuple(ORDERS)] | None = Field(  # type: ignore[valid-type]
+        None, description="a model by name in the place of F and Q: " + ", ".join(ORDERS)
+    )
+    axes: int = Field(2, ge=1, strict=True, description="1, 2 or 3; states are ordered axis by axis: x, vx, y, vy")
+    step: Series = Field(1.0, description="time since the step before in s, or one per step (the first is not used)")
+    noise: Number | None = Field(
+        None, description="of a kind: the white noise's density (continuous), or a standard deviation (piecewise)"
+    )
+    noise_kind: Literal[NOISES] = Field(  # type: ignore[valid-type]
+        "continuous", description="continuous: white noise all the time; piecewise: one acceleration for each step"
+    )
+    turn_rate: Series | None = Field(None, description="of a coordinated turn, rad/s from x to y, or one per step")
+    nominal: NominalTable | None = Field(None, description="where the target is meant to be, for sensors by name")
+    sensor: SensorTable | None = Field(None, description="sensor by name in the place of H and R, at every position")
     own: bool = Field(False, strict=True, description="true: every agent has a state of its own, all of this model")
     G: Matrix | None = Field(None, description="process noise gain, default the identity")
     B: Matrix | None = Field(None, description="input matrix")
@@ -187,13 +245,17 @@ class AgentTable(StrictTable):
 
     H: Matrix | None = None
     R: Matrix | None = None
-    sensor: bool = Field(True, strict=True, description="false: this agent measures nothing itself")
+    sensor: SensorChoice = Field(
+        True, description="a sensor by name in the place of H and R; false: this agent measures nothing itself"
+    )
     F: Matrix | None = Field(None, description="transition of the agent's own filter")
     Q: Matrix | None = Field(None, description="process noise of the agent's own filter")
     P: Matrix | None = Field(None, description="covariance of the agent's first estimate")
     M: Matrix | None = Field(None, description="mapping of a parallel filter's state into the state, x = M x_i + s")
     s: Vector | None = Field(None, description="offset of that mapping, default zero")
-    position: Vector | None = Field(None, description="nominal place for cooperative measurements, or one per step")
+    position: Vector | None = Field(
+        None, description="place of a sensor by name, or nominal place for cooperative measurements, or one per step, m"
+    )
 
 
 class NoiseTable(StrictTable):
@@ -265,11 +327,16 @@ _SHAPES = {
     "place": "a list of coordinates, or one such list per step",
     "correlation": "a number or a matrix (a list of rows)",
     "disturbance": "a variance, a list of variances, or a matrix (a list of rows)",
+    "series": "a number, or one per step",
+    "deviation": "a standard deviation, or a list of them",
 }
+_FORMS = (("sensor", "flag"), ("sensor", "table"))
 _SHAPE_OF = {
     **dict.fromkeys(("F", "H", "Q", "R", "G", "B", "P", "M"), "matrix"),
     **dict.fromkeys(("u", "x", "error", "s"), "vector"),
-    "position": "place",
+    **dict.fromkeys(("position", "velocity", "acceleration"), "place"),
+    **dict.fromkeys(("step", "turn_rate", "heading", "detection"), "series"),
+    "sigma": "deviation",
     "disturbance": "disturbance",
     "link": "link",
     "delay": "delay",
@@ -281,8 +348,21 @@ def structure_problems(mapping: Any) -> list[Problem]:
     problems = []
     if isinstance(mapping, dict) and "navigation" not in mapping:
         problems = [Problem(key, "a value", "nothing") for key in ("model", "initial") if key not in mapping]
+        problems += _missing_matrices(mapping)
     known = {problem.path for problem in problems}
     return problems + [problem for problem in problems_of(ScenarioFile, mapping) if problem.path not in known]
+
+
+def _missing_matrices(mapping: Mapping[str, Any]) -> list[Problem]:
+    """Matrices of [model] that nothing else in the file says."""
+    model, agents = mapping.get("model"), mapping.get("agent")
+    if not isinstance(model, Mapping):
+        return []
+    motion = [] if model.get("kind") is not None else ["F", "Q"]
+    # agents may all have sensors of their own, but half a sensor is none
+    elsewhere = model.get("sensor") is not None or (agents and model.get("H") is None and model.get("R") is None)
+    order = [key for key in ("F", "H", "Q", "R") if key in (motion if elsewhere else [*motion, "H", "R"])]
+    return [Problem(f"model.{key}", "a value", "nothing") for key in order if model.get(key) is None]
 
 
 def problems_of(
@@ -329,7 +409,7 @@ def _tables(annotation: Any) -> list[type[BaseModel]]:
 
 
 def _problem(structure: type[BaseModel], entry: Any) -> Problem:
-    location = list(entry["loc"])
+    location = _without_alternatives(entry["loc"])
     if location[:2] == ["noise", "correlation"]:
         return Problem("noise.correlation", _SHAPES["correlation"], _got(entry, location[2:]))
     for place, part in enumerate(location):
@@ -341,6 +421,10 @@ def _problem(structure: type[BaseModel], entry: Any) -> Problem:
         expected = "one of " + str(context["expected"]).replace("'", '"').replace(" or ", ", ")
     elif kind == "greater_than_equal":
         expected = f"a whole number of at least {context['ge']}"
+    elif entry["loc"][-1:] in (("int",), ("float",)):
+        expected = _KINDS["float_type"]
+    elif entry["loc"][-2:] == _FORMS[0]:
+        expected = "false, or a table"
     else:
         expected = _KINDS.get(kind, str(entry["msg"]))
     if kind == "extra_forbidden":
@@ -348,6 +432,12 @@ def _problem(structure: type[BaseModel], entry: Any) -> Problem:
     else:
         got = "nothing" if kind == "missing" else shown(entry["input"])
     return Problem(_path(location) or "scenario", expected, got)
+
+
+def _without_alternatives(location: Sequence[Any]) -> list[Any]:
+    """Where a problem is, without what a union's alternatives are called."""
+    kept = [part for before, part in zip((None, *location), location, strict=False) if (before, part) not in _FORMS]
+    return kept[:-1] if kept[-1:] in (["int"], ["float"]) else kept
 
 
 def _got(entry: Any, rest: list[Any]) -> str:

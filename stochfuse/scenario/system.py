@@ -234,7 +234,7 @@ def _seen(sensor: Sensor, steps: int) -> Sensor:
     H, R = sensor.H, sensor.R
     if H.shape[-2] == 0:
         H, R = np.zeros((1, H.shape[-1])), np.eye(1)
-    return Sensor(over_steps(H, steps), over_steps(R, steps), sensor.detection)
+    return replace(sensor, H=over_steps(H, steps), R=over_steps(R, steps))
 
 
 def _labels(scenario: Scenario) -> tuple[int, ...]:

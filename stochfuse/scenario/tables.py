@@ -13,7 +13,9 @@ import numpy as np
 from stochfuse.kalman.checks import shown
 from stochfuse.scenario.checker import Checker
 from stochfuse.scenario.model import Filter, Model, Noise, Sensor
+from stochfuse.scenario.motion import read_motion, read_step, refuse_keys_of_kinds
 from stochfuse.scenario.network import ARCHITECTURES, Network, mean_delivery, possible_senders
+from stochfuse.scenario.sensing import sometimes
 
 MOST_DELAY = 10_000
 """Largest delay of a message, in steps."""
@@ -209,14 +211,13 @@ def _delay(check: Checker, path: str, value: Any) -> Delay:
 
 def read_model(check: Checker, table: Mapping[str, Any], steps: int) -> tuple[Model | None, Sensor | None]:
     """Read [model]: the model, and the sensor of agents that have no other."""
-    F = check.matrix("model.F", table.get("F"), None, None, steps)
-    if F is not None and F.shape[-1] != F.shape[-2]:
-        check.note("model.F", "a square matrix", f"a {F.shape[-2]}×{F.shape[-1]} matrix")
-        F = None
+    motion = None
+    if table.get("kind") is not None:
+        motion = read_motion(check, table, steps)
+        F, Q = (None, None) if motion is None else (motion.F, motion.Q)
+    else:
+        F, Q = _matrices(check, table, steps)
     d = None if F is None else F.shape[-1]
-    G = check.matrix("model.G", table.get("G"), d, None, steps, identity=True)
-    noises = G.shape[-1] if G is not None else None if table.get("G") is not None else d
-    Q = check.covariance("model.Q", table.get("Q"), noises, steps)
     B = check.matrix("model.B", table.get("B"), d, None, steps)
     u = check.vector("model.u", table.get("u"), None if B is None else B.shape[-1], steps)
     if table.get("u") is not None and table.get("B") is None:
@@ -228,12 +229,27 @@ def read_model(check: Checker, table: Mapping[str, Any], steps: int) -> tuple[Mo
         return None, default
     model = Model(
         F=F,
-        Q=Q if G is None else G @ Q @ np.swapaxes(G, -1, -2),
+        Q=Q,
         Bu=np.zeros((d, 1)) if B is None or u is None else B @ u,
-        states=states or tuple("x" if d == 1 else f"x{i}" for i in range(1, d + 1)),
-        units=units or ("",) * d,
+        states=states or (motion.states if motion else tuple("x" if d == 1 else f"x{i}" for i in range(1, d + 1))),
+        units=units or (motion.units if motion else ("",) * d),
     )
     return model, default
+
+
+def _matrices(check: Checker, table: Mapping[str, Any], steps: int) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """F, and Q as it enters the state, of a model that is written out."""
+    refuse_keys_of_kinds(check, table)
+    read_step(check, table, steps)
+    F = check.matrix("model.F", table.get("F"), None, None, steps)
+    if F is not None and F.shape[-1] != F.shape[-2]:
+        check.note("model.F", "a square matrix", f"a {F.shape[-2]}×{F.shape[-1]} matrix")
+        F = None
+    d = None if F is None else F.shape[-1]
+    G = check.matrix("model.G", table.get("G"), d, None, steps, identity=True)
+    noises = G.shape[-1] if G is not None else None if table.get("G") is not None else d
+    Q = check.covariance("model.Q", table.get("Q"), noises, steps)
+    return F, Q if G is None or Q is None else G @ Q @ np.swapaxes(G, -1, -2)
 
 
 def _names(check: Checker, path: str, value: Any, d: int | None) -> tuple[str, ...] | None:
@@ -262,7 +278,11 @@ def _sensor(
             check.note(f"{path}.R", f"a {H.shape[-2]}×{H.shape[-2]} matrix, to go with its own H", "nothing")
     else:
         R = check.covariance(f"{path}.R", table.get("R"), None if H is None else H.shape[-2], steps, definite=True)
-    return None if H is None or R is None else Sensor(H, R)
+    if H is None or R is None:
+        return None
+    inherited = default is not None and table.get("H") is None and table.get("R") is None
+    detection = default.detection if default is not None and inherited else None
+    return sometimes(check, f"{path}.sensor", table.get("sensor"), Sensor(H, R, detection), steps)
 
 
 def read_sensors(
@@ -272,8 +292,15 @@ def read_sensors(
     d: int | None,
     filters: Sequence[Filter],
     network: Network | None,
+    named: Mapping[int, Sensor | None],
 ) -> tuple[tuple[Sensor, ...], tuple[int, ...]]:
-    """Read [[agent]]: the different sensors, and which of them every agent has."""
+    """Read [[agent]]: the different sensors, and which of them every agent has.
+
+    Parameters
+    ----------
+    named : sensors by name, by agent counted from 0; None where something is wrong with one.
+    """
+    default = named.get(0) if named and not agents else default
     if network is None or (default is None and not agents):
         return (), ()
     if not agents:
@@ -286,7 +313,9 @@ def read_sensors(
     for i, table in enumerate(agents, start=1):
         path, table = f"agent[{i}]", table if isinstance(table, dict) else {}
         size = filters[i - 1].dimension if filters else d
-        if table.get("sensor") is False:
+        if i - 1 in named:
+            sensor = named[i - 1]
+        elif table.get("sensor") is False:
             sensor = Sensor(np.zeros((0, size or 1)), np.zeros((0, 0)))
             for key in {"H", "R"} & set(table):
                 check.note(f"{path}.{key}", "nothing, since sensor = false", shown(table[key]))
@@ -299,7 +328,8 @@ def read_sensors(
             sensor = _sensor(check, path, table, size, network.steps, fitting)
         if sensor is None:
             continue
-        key = (sensor.H.shape, sensor.H.tobytes(), sensor.R.shape, sensor.R.tobytes())
+        detection = None if sensor.detection is None else sensor.detection.tobytes()
+        key = (sensor.H.shape, sensor.H.tobytes(), sensor.R.shape, sensor.R.tobytes(), detection)
         if key not in different:
             different[key] = len(sensors)
             sensors.append(sensor)

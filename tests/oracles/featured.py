@@ -88,6 +88,12 @@ def _no_sensor(made: Mapping) -> None:
     table |= {"sensor": False}
 
 
+def _detection(made: Mapping) -> None:
+    for table in _tables(made):
+        if table.get("sensor") is not False:
+            table["sensor"] = {"detection": 0.7}
+
+
 def _unlike_noises(made: Mapping) -> None:
     _tables(made)[0]["R"] = [[1.7]]
 
@@ -142,6 +148,7 @@ _PUT: dict[str, Callable[[Mapping], None]] = {
     "unlike-sensors": _unlike_sensors,
     "sensor-pauses": _sensor_pauses,
     "no-sensor": _no_sensor,
+    "detection": _detection,
     "matrices-per-step": _by_step,
     "shared-start": _initial(correlation="shared"),
     "initial-error": _error,
