@@ -4,7 +4,8 @@
     [model]      F, H, Q, R as nested lists or a number; optional G, B, u; optional states and units (names)
     [initial]    P, correlation = "independent" | "shared", optional x and error (a known initial bias)
     [network]    agents, steps, architecture, link = number | matrix | one of either per step, optional delay, case
-    [[agent]]    optional, for unlike agents: its own H, R
+    [network.radio]  instead of link: a link budget, which gives it with the agents' positions
+    [[agent]]    optional, for unlike agents: its own H, R; name and position
 
 Step 1 holds the agents' initial estimates and the first exchange: nothing is predicted or measured before it (thesis
 3.1).  With correlation = "independent" the initial errors are the agents' own, so that nothing is shared at step 1;
@@ -174,8 +175,8 @@ def load_scenario(source: str | Path | Mapping[str, Any] = DEFAULT, **overrides:
     source : a preset's name, a TOML or JSON file's path, "-" for standard input, or a mapping with a file's keys, whose
         lists and numbers may be NumPy's.
     **overrides : agents, steps, architecture, q, r, p0: numbers that take the place of network.agents, network.steps,
-        network.architecture, model.Q, model.R and initial.P; `uniform_link=True` drops the file's link and cases, for a
-        caller who gives the link probability.  For a state of several dimensions a number is that multiple of the
+        network.architecture, model.Q, model.R and initial.P; `uniform_link=True` drops the file's link, radio and cases,
+        for a caller who gives the link probability.  For a state of several dimensions a number is that multiple of the
         identity.
 
     Raises
@@ -220,7 +221,7 @@ def _with_links(mapping: Any, name: str, folder: Path) -> Any:
         return mapping
     from stochfuse.scenario.links import read_links
 
-    nodes, agents = network.get("nodes"), network.get("agents")
+    nodes, agents = network.get("nodes") or _all_names(mapping.get("agent")), network.get("agents")
     try:
         found = read_links(folder / given["file"])
         found = found.of([str(node) for node in nodes]) if isinstance(nodes, list) else found
@@ -238,6 +239,12 @@ def _with_links(mapping: Any, name: str, folder: Path) -> Any:
             raise ScenarioError(name, [Problem("network.link.file", expected, got)])
         link[i, j] = 0.0
     return {**mapping, "network": {**network, "agents": n, "nodes": list(found.nodes), "link": link.tolist()}}
+
+
+def _all_names(tables: Any) -> list[str] | None:
+    """Names of [[agent]] tables that all have one."""
+    names = [table.get("name") if isinstance(table, Mapping) else None for table in tables or ()]
+    return names if names and all(isinstance(name, str) for name in names) else None
 
 
 def checked_scenario(source: str | Path) -> Scenario:
@@ -397,7 +404,7 @@ def _override(mapping: dict[str, Any], overrides: Mapping[str, Any]) -> dict[str
     }
     network = mapping.get("network")
     if overrides.get("uniform_link") and isinstance(network, dict):
-        mapping["network"] = {key: value for key, value in network.items() if key not in ("link", "case", "burst")}
+        mapping["network"] = {key: value for key, value in network.items() if key not in ("link", "radio", "case", "burst")}
     for key, value in overrides.items():
         if value is None or key == "uniform_link":
             continue
@@ -418,7 +425,7 @@ def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> S
     tables = {key: mapping[key] if isinstance(mapping.get(key), dict) else {} for key in names}
     agents, initial = mapping.get("agent"), tables["initial"]
     agents = agents if isinstance(agents, list) else None
-    network = read_network(check, tables["network"])
+    network = read_network(check, tables["network"], agents)
     own = tables["model"].get("own") is True
     if isinstance(mapping.get("navigation"), dict):
         (model, P0), default = _navigation(check, mapping, network), None
@@ -505,7 +512,7 @@ def _relations(
     """What agents measure of each other."""
     agents = mapping.get("agent")
     tables = [table for table in agents if isinstance(table, dict)] if isinstance(agents, list) else []
-    if "cooperative" not in mapping and not any("position" in table for table in tables):
+    if "cooperative" not in mapping and not (own and any("position" in table for table in tables)):
         if own:
             check.note("cooperative", "what agents with states of their own measure of each other", "nothing")
         return {}

@@ -154,6 +154,21 @@ class LinkFile(StrictTable):
     file: str = Field(description="its path, relative to the scenario file; see `stochfuse links`")
 
 
+class RadioTable(StrictTable):
+    """A radio link's budget: with the agents' places it gives the link probabilities."""
+
+    transmit_power: Number = Field(description="dBm")
+    gain: Number = Field(0.0, description="antenna gains of both ends, less what cables take, dB")
+    exponent: Number = Field(2.0, description="of the path loss over distance; 2 in free space")
+    reference_distance: Number = Field(1.0, description="m; nearer than that the loss is the reference loss")
+    reference_loss: Number = Field(description="path loss at the reference distance, dB")
+    sensitivity: Number = Field(description="least power that a receiver can read, dBm")
+    fading: Literal["none", "rayleigh", "shadowing"] = Field(
+        "none", description="none: all or nothing; rayleigh: block fading, drawn for each message; shadowing: log-normal"
+    )
+    shadowing: Number | None = Field(None, description="standard deviation of log-normal shadowing, dB")
+
+
 class NetworkTable(StrictTable):
     """Who may hear whom, and how likely."""
 
@@ -164,6 +179,9 @@ class NetworkTable(StrictTable):
         None,
         description="link probability: a number, a matrix (row: receiver, column: sender), or one of either per step; "
         "or { file = ... }, a packet log; left out, it is tabulated from 0 to 1",
+    )
+    radio: RadioTable | None = Field(
+        None, description="link probabilities from a link budget and every agent's position, instead of link"
     )
     nodes: list[str] | None = Field(None, description="names of the agents in order: which nodes of a file they are")
     burst: BurstTable | None = Field(None, description="bursty links, instead of a link probability")
@@ -179,6 +197,7 @@ class NetworkTable(StrictTable):
 class AgentTable(StrictTable):
     """One agent's own sensor, filter and place, where they differ from the model's."""
 
+    name: str | None = Field(None, description="name of the agent, its own; default: its number")
     H: Matrix | None = None
     R: Matrix | None = None
     sensor: bool = Field(True, strict=True, description="false: this agent measures nothing itself")
@@ -187,7 +206,11 @@ class AgentTable(StrictTable):
     P: Matrix | None = Field(None, description="covariance of the agent's first estimate")
     M: Matrix | None = Field(None, description="mapping of a parallel filter's state into the state, x = M x_i + s")
     s: Vector | None = Field(None, description="offset of that mapping, default zero")
-    position: Vector | None = Field(None, description="nominal place for cooperative measurements, or one per step")
+    position: Vector | None = Field(
+        None,
+        description="place in m, 2 or 3 coordinates, or one such list per step: for network.radio, and the nominal place "
+        "for cooperative measurements",
+    )
 
 
 class NoiseTable(StrictTable):
