@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -32,14 +33,14 @@ def links_report(found: Links, at: Sequence[int] | None = None) -> Report:
     """
     if found.steps is None:
         return Report.of(found, links_table, links_csv, links_json, draw)
-    steps = tuple(at or sorted({1, (found.steps + 1) // 2, found.steps})) if found.varies else (1,)
+    steps = tuple(at or sorted({1, (found.steps + 1) // 2, found.steps}))
     flat = not (found.places or found.varies or found.cases)
     figure = draw if flat else partial(draw_network, steps=steps)
     return Report.of(found, partial(scenario_tables, steps=steps), links_csv, links_json, figure)
 
 
 def scenario_tables(found: Links, steps: Sequence[int]) -> list[Table]:
-    """Return µ receiver × sender of a scenario, at some steps or of each case, and what each link does over the steps."""
+    """Return µ receiver × sender of a scenario, at some steps or of each case, and each link over the steps."""
     n = len(found.nodes)
     head = f"Link probabilities of {found.source} ({found.kind}): {n} agents, {found.architecture}, {found.steps} steps"
     shown = [(f"case {name}", link) for name, link in found.cases] or [("", found.link)]
@@ -50,50 +51,42 @@ def scenario_tables(found: Links, steps: Sequence[int]) -> list[Table]:
             titles = [title for title in (what, f"step {step}" if step else "") if title]
             lines = (head, "rows receive, columns send") if not tables else ()
             tables.append(_matrix(found.nodes, now, (*lines, *titles)))
-    return [*tables, _each(found)] if n > 1 and (found.varies or found.places) else tables
+    single = n > 1 and not found.cases and (found.varies or found.places)
+    return [*tables, _each(found)] if single else tables
 
 
 def _each(found: Links) -> Table:
-    """Each link over the steps, with distance and received power where they are known; both ways in one row if alike."""
+    """Each link over the steps, with distance and received power if known; both ways in one row if alike."""
     link = found.link if found.varies else found.link[None]
     alike = bool((np.nan_to_num(link) == np.nan_to_num(np.swapaxes(link, 1, 2))).all())
-    columns = {f"µ {which}".strip(): of(link) for which, of in _over(found.varies)}
+    columns = _over("µ", ".3f", link, ("from", "mean", "to"))
     if found.places:
         d = distances(found.places)
         d = d if d.ndim == 3 else d[None]
-        for which, of in _over(len(d) > 1):
-            if which != "mean":
-                columns[f"m {which}".strip()] = of(d)
+        columns += _over("m", ".1f", d, ("from", "to"))
         if found.radio is not None:
-            power = found.radio.received(d)
-            for which, of in _over(len(d) > 1):
-                if which != "mean":
-                    columns[f"dBm {which}".strip()] = of(power)
-    pairs = [(i, j) for i in range(len(found.nodes)) for j in range(len(found.nodes)) if (i < j if alike else i != j)]
+            columns += _over("dBm", ".1f", found.radio.received(d), ("from", "to"))
+    n = len(found.nodes)
     rows = tuple(
-        (
-            found.nodes[i],
-            found.nodes[j],
-            *(f"{M[i, j]:.3f}" if "µ" in name else f"{M[i, j]:.1f}" for name, M in columns.items()),
-        )
-        for i, j in pairs
+        (found.nodes[i], found.nodes[j], *(f"{M[i, j]:{form}}" for _, form, M in columns))
+        for i, j in product(range(n), repeat=2)
+        if (i < j if alike else i != j)
     )
     both = "the same both ways" if alike else "receiver and sender"
     sensitivity = "" if found.radio is None else f"; sensitivity {found.radio.sensitivity:g} dBm"
     over = " over the steps" if found.varies else ""
     title = (f"Each link{over}: {both}{'; distance in m' if found.places else ''}{sensitivity}",)
-    return Table(title, ("agent", "and") if alike else ("receiver", "sender"), tuple(columns), rows)
+    return Table(
+        title, ("agent", "and") if alike else ("receiver", "sender"), tuple(name for name, *_ in columns), rows
+    )
 
 
-def _over(varies: bool) -> list[tuple[str, Any]]:
-    """What is shown of a stack over the steps."""
-    if not varies:
-        return [("", lambda M: M[0])]
-    return [
-        ("from", lambda M: M.min(axis=0)),
-        ("mean", lambda M: M.mean(axis=0)),
-        ("to", lambda M: M.max(axis=0)),
-    ]
+def _over(what: str, form: str, M: np.ndarray, which: Sequence[str]) -> list[tuple[str, str, np.ndarray]]:
+    """Columns of a stack over the steps: name, format and numbers; itself where it has but one step."""
+    if len(M) == 1:
+        return [(what, form, M[0])]
+    of = {"from": M.min, "mean": M.mean, "to": M.max}
+    return [(f"{what} {name}", form, of[name](axis=0)) for name in which]
 
 
 def _matrix(names: Sequence[str], link: np.ndarray, title: tuple[str, ...]) -> Table:
@@ -101,9 +94,7 @@ def _matrix(names: Sequence[str], link: np.ndarray, title: tuple[str, ...]) -> T
     short = max(map(len, names)) <= 7
     labels = names if short else tuple(f"{i + 1}: {name}" for i, name in enumerate(names))
     across = tuple(names) if short else tuple(str(i + 1) for i in range(len(names)))
-    rows = tuple(
-        (labels[i], *("-" if i == j else _shown(µ) for j, µ in enumerate(row))) for i, row in enumerate(link)
-    )
+    rows = tuple((labels[i], *("-" if i == j else _shown(µ) for j, µ in enumerate(row))) for i, row in enumerate(link))
     return Table(title, ("receiver",), across, rows)
 
 

@@ -88,13 +88,17 @@ def _varies(system: System) -> bool:
     return system.model.varies or any(sensor.varies for sensor in system.sensors)
 
 
+def _unequal(system: System, links: LinkRows) -> bool:
+    return not links.uniform and system.network.hears is None
+
+
 FEATURES = (
     Feature("no-sensor", "[[agent]] sensor = false", lambda s, _: any(_blind(s)[k] for k in s.sensor_of)),
     Feature("sensor-pauses", "[[agent]] H of zeros in some steps", lambda s, _: _at_times(s)),
     Feature("unlike-noises", "[[agent]] R", lambda s, _: len(s.sensors) > 1 and not _unlike(s)),
     Feature("unlike-sensors", "[[agent]] H", lambda s, _: _unlike(s)),
     Feature("matrices-per-step", "model.F, Q, H, R per step", lambda s, _: _varies(s)),
-    Feature("unequal-links", "network.link as a matrix, network.radio", lambda s, r: not r.uniform and s.network.hears is None),
+    Feature("unequal-links", "network.link as a matrix, network.radio", _unequal),
     Feature("links-per-step", "network.link per step, network.radio with paths", lambda s, r: r.varies),
     Feature("masks", "network.hears", lambda s, _: s.network.hears is not None),
     Feature("cases", "[[network.case]]", lambda s, r: r.names is not None),

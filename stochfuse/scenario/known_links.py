@@ -17,7 +17,7 @@ from stochfuse.scenario.links import Links, links_of_packets, read_links
 from stochfuse.scenario.network import Network, reachable
 from stochfuse.scenario.scenario import Scenario, is_preset, load_scenario
 
-MOST_NUMBERS = 20_000_000
+MOST_NUMBERS = 4_000_000
 """Link probabilities that are laid out one by one."""
 
 
@@ -111,11 +111,13 @@ def _kind(network: Network) -> str:
     return "network.burst" if network.burst is not None else "network.link" if network.link is not None else "cases"
 
 
-def _bursts(network: Network) -> dict[tuple[int, int], Mapping[str, float]] | None:
+def _bursts(network: Network) -> Mapping[tuple[int, int], Mapping[str, float]] | None:
     if network.burst is None:
         return None
-    burst = dict(zip(("good_to_bad", "bad_to_good", "good", "bad"), network.burst.tolist(), strict=True))
-    return {(i, j): burst for i, j in np.argwhere(reachable(network)).tolist()}
+    keys = ("good_to_bad", "bad_to_good", "good", "bad")
+    burst: Mapping[str, float] = {key: float(value) for key, value in zip(keys, network.burst, strict=True)}
+    receivers, senders = np.nonzero(reachable(network))
+    return dict.fromkeys(zip(receivers.tolist(), senders.tolist(), strict=True), burst)
 
 
 def _notes(network: Network) -> tuple[str, ...]:

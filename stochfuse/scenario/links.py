@@ -96,6 +96,11 @@ class Links:
         return self.link.ndim == 3
 
     @property
+    def moves(self) -> bool:
+        """Whether some agent is on its way."""
+        return any(place.ndim == 2 for place in self.places)
+
+    @property
     def unknown(self) -> list[tuple[str, str]]:
         """Receiver and sender of links of which nothing is known."""
         off = ~np.eye(len(self.nodes), dtype=bool)

@@ -122,11 +122,8 @@ _POSITIVE = ("exponent", "reference_distance", "shadowing")
 
 def _number(check: Checker, path: str, value: Any, *, positive: bool) -> float | None:
     expected = "a number above 0" if positive else "a number"
-    if value is None:
-        check.note(path, expected, "nothing")
-        return None
     array = check.array(path, value, expected)
-    if array is None:
+    if array is None:  # what is missing the structure of the file has told
         return None
     if array.ndim or (positive and array <= 0):
         check.note(path, expected, shown(value))

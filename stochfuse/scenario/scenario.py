@@ -118,7 +118,7 @@ class Scenario:
         """
         from stochfuse.scenario.schema import structure_problems
 
-        mapping = _with_links(as_file(mapping, name), name, folder)
+        mapping = with_links(as_file(mapping, name), name, folder)
         return _build(mapping, name, structure_problems(mapping))
 
     def until(self, step: int) -> Scenario:
@@ -175,9 +175,9 @@ def load_scenario(source: str | Path | Mapping[str, Any] = DEFAULT, **overrides:
     source : a preset's name, a TOML or JSON file's path, "-" for standard input, or a mapping with a file's keys, whose
         lists and numbers may be NumPy's.
     **overrides : agents, steps, architecture, q, r, p0: numbers that take the place of network.agents, network.steps,
-        network.architecture, model.Q, model.R and initial.P; `uniform_link=True` drops the file's link, radio and cases,
-        for a caller who gives the link probability.  For a state of several dimensions a number is that multiple of the
-        identity.
+        network.architecture, model.Q, model.R and initial.P; `uniform_link=True` drops the file's link, radio, burst
+        and cases, for a caller who gives the link probability.  For a state of several dimensions a number is that
+        multiple of the identity.
 
     Raises
     ------
@@ -204,10 +204,10 @@ def load_scenario(source: str | Path | Mapping[str, Any] = DEFAULT, **overrides:
     if is_preset(source):
         # the presets' structure is checked by the tests; pydantic would double the time of a plain `predict`
         return _build(mapping, name, [])
-    return Scenario.from_mapping(mapping, name, _folder(source))
+    return Scenario.from_mapping(mapping, name, folder_of(source))
 
 
-def _with_links(mapping: Any, name: str, folder: Path) -> Any:
+def with_links(mapping: Any, name: str, folder: Path) -> Any:
     """The mapping with the link probabilities of a file in the place of its name.
 
     Raises
@@ -243,17 +243,20 @@ def _with_links(mapping: Any, name: str, folder: Path) -> Any:
 
 def _all_names(tables: Any) -> list[str] | None:
     """Names of [[agent]] tables that all have one."""
-    names = [table.get("name") if isinstance(table, Mapping) else None for table in tables or ()]
-    return names if names and all(isinstance(name, str) for name in names) else None
+    listed = tables if isinstance(tables, list) else []
+    given = [table.get("name") for table in listed if isinstance(table, Mapping)]
+    names = [name for name in given if isinstance(name, str)]
+    return names if names and len(names) == len(listed) else None
 
 
 def checked_scenario(source: str | Path) -> Scenario:
     """Read a scenario with every check, presets included; see `load_scenario`."""
     name, text = read_text(source)
-    return Scenario.from_mapping(parse(name, text), name, _folder(source))
+    return Scenario.from_mapping(parse(name, text), name, folder_of(source))
 
 
-def _folder(source: str | Path) -> Path:
+def folder_of(source: str | Path) -> Path:
+    """What paths of files in a scenario are relative to."""
     return Path() if source == "-" or is_preset(source) else Path(source).parent
 
 
@@ -404,7 +407,9 @@ def _override(mapping: dict[str, Any], overrides: Mapping[str, Any]) -> dict[str
     }
     network = mapping.get("network")
     if overrides.get("uniform_link") and isinstance(network, dict):
-        mapping["network"] = {key: value for key, value in network.items() if key not in ("link", "radio", "case", "burst")}
+        mapping["network"] = {
+            key: value for key, value in network.items() if key not in ("link", "radio", "case", "burst")
+        }
     for key, value in overrides.items():
         if value is None or key == "uniform_link":
             continue

@@ -157,16 +157,17 @@ class LinkFile(StrictTable):
 class RadioTable(StrictTable):
     """A radio link's budget: with the agents' places it gives the link probabilities."""
 
-    transmit_power: Number = Field(description="dBm")
-    gain: Number = Field(0.0, description="antenna gains of both ends, less what cables take, dB")
-    exponent: Number = Field(2.0, description="of the path loss over distance; 2 in free space")
-    reference_distance: Number = Field(1.0, description="m; nearer than that the loss is the reference loss")
-    reference_loss: Number = Field(description="path loss at the reference distance, dB")
-    sensitivity: Number = Field(description="least power that a receiver can read, dBm")
+    transmit_power: Real = Field(description="dBm")
+    gain: Real = Field(0.0, description="antenna gains of both ends, less what cables take, dB")
+    exponent: Real = Field(2.0, description="of the path loss over distance; 2 in free space")
+    reference_distance: Real = Field(1.0, description="m; nearer than that the loss is the reference loss")
+    reference_loss: Real = Field(description="path loss at the reference distance, dB")
+    sensitivity: Real = Field(description="least power that a receiver can read, dBm")
     fading: Literal["none", "rayleigh", "shadowing"] = Field(
-        "none", description="none: all or nothing; rayleigh: block fading, drawn for each message; shadowing: log-normal"
+        "none",
+        description="none: all or nothing; rayleigh: block fading, drawn for each message; shadowing: log-normal",
     )
-    shadowing: Number | None = Field(None, description="standard deviation of log-normal shadowing, dB")
+    shadowing: Real | None = Field(None, description="standard deviation of log-normal shadowing, dB")
 
 
 class NetworkTable(StrictTable):
@@ -208,8 +209,8 @@ class AgentTable(StrictTable):
     s: Vector | None = Field(None, description="offset of that mapping, default zero")
     position: Vector | None = Field(
         None,
-        description="place in m, 2 or 3 coordinates, or one such list per step: for network.radio, and the nominal place "
-        "for cooperative measurements",
+        description="place in m, 2 or 3 coordinates, or one such list per step: for network.radio, and the nominal "
+        "place for cooperative measurements",
     )
 
 
