@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from stochfuse.questions.sensitivity import Sensitivity as Sensitivity
     from stochfuse.questions.sensitivity import sensitivity as sensitivity
     from stochfuse.questions.sensitivity import share_of_gain as share_of_gain
-    from stochfuse.scenario.links import links as links
+    from stochfuse.scenario.known_links import links as links
     from stochfuse.scenario.scenario import Scenario as Scenario
     from stochfuse.scenario.scenario import load_scenario as load_scenario
     from stochfuse.studies.running import study as study
@@ -72,7 +72,7 @@ _HOME = {
     "derive_optimal": "symbolic.optimal",
     "derive_simplified": "symbolic.simplified",
     "least_link": "questions.least_link",
-    "links": "scenario.links",
+    "links": "scenario.known_links",
     "load_history": "estimators.fusion_graph",
     "load_scenario": "scenario.scenario",
     "message_load": "questions.messages",

@@ -1,4 +1,4 @@
-"""`stochfuse links`: link probabilities from a packet log, or from another file that people have."""
+"""`stochfuse links`: link probabilities from a packet log, from another file that people have, or of a scenario."""
 
 from __future__ import annotations
 
@@ -7,10 +7,14 @@ from typing import Annotated
 
 import typer
 
-from stochfuse.cli.options import NETWORK, OUTPUT, Written, option
+from stochfuse.cli.options import NETWORK, OUTPUT, SHOWN, Written, option, steps_at
 from stochfuse.errors import UsageError
 
-EXAMPLES = ("stochfuse links log.csv --plot links.png", "stochfuse links log.csv --nodes a,b,c --write network.toml")
+EXAMPLES = (
+    "stochfuse links log.csv --plot links.png",
+    "stochfuse links log.csv --nodes a,b,c --write network.toml",
+    "stochfuse links road-5 --plot road.png",
+)
 
 
 def links(
@@ -18,7 +22,8 @@ def links(
         str,
         typer.Argument(
             metavar="FILE",
-            help="CSV or Parquet: a packet log, a Mercator or k7 file, an edge list or a matrix.",
+            help="CSV or Parquet: a packet log, a Mercator or k7 file, an edge list or a matrix; or a scenario "
+            "(.toml, .json, a preset).",
         ),
     ],
     columns: Annotated[
@@ -34,20 +39,37 @@ def links(
     step: Annotated[
         float | None, option("Seconds in a step: delays from sent_time and received_time.", NETWORK, metavar="S")
     ] = None,
+    at: Annotated[
+        str | None,
+        option("Steps of a scenario to show: 1,5,last; default: first, middle and last.", SHOWN, metavar="STEPS"),
+    ] = None,
     write: Annotated[Path | None, option("Write a scenario's [network] there.", OUTPUT, metavar="FILE.toml")] = None,
     to: Written = Written(),
 ) -> None:
     """Show link probabilities with their 95 % intervals, asymmetry and memory, and what is unknown.
 
-    Of a log of received packets alone, what was sent is taken from each sender's sequence numbers.
+    Of a log of received packets alone, what was sent is taken from each sender's sequence numbers. Of a scenario:
+    what its radio and places, its file or its matrix give.
     """
     from stochfuse.report.links import links_report, network_table
     from stochfuse.report.table import check_writable, write_text
+    from stochfuse.scenario.known_links import is_scenario, links_of_scenario
     from stochfuse.scenario.links import read_links
+    from stochfuse.scenario.scenario import load_scenario
 
     to.check(file)
     check_writable(write, (".toml",))
-    found = read_links(file, columns=_pairs(columns), sent=sent, step=step)
+    steps = None
+    if is_scenario(file):
+        for name, value in (("--columns", columns), ("--sent", sent), ("--step", step)):
+            if value is not None:
+                raise UsageError(f"{name}: expected a file of links to go with it, got a scenario")
+        scenario = load_scenario(file)
+        found, steps = links_of_scenario(scenario), steps_at(at, scenario)
+    elif at is not None:
+        raise UsageError("--at: expected a scenario to go with it, got a file of links")
+    else:
+        found = read_links(file, columns=_pairs(columns), sent=sent, step=step)
     if nodes is not None:
         found = found.of([node.strip() for node in nodes.split(",")])
     for note in found.notes:
@@ -58,7 +80,7 @@ def links(
         typer.echo(f"note: nothing is known of {some}{more}", err=True)
     if write is not None:
         write_text(network_table(found), write)
-    to.write(links_report(found))
+    to.write(links_report(found, steps))
 
 
 def _pairs(text: str | None) -> dict[str, str]:

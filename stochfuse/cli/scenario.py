@@ -102,10 +102,10 @@ def show(
 ) -> None:
     """Print a scenario, after checking it, in a form that can be saved and edited."""
     from stochfuse.report.table import to_json, write_text
-    from stochfuse.scenario.scenario import Scenario, parse, read_text
+    from stochfuse.scenario.scenario import Scenario, folder_of, parse, read_text
 
     name, text = read_text(scenario)
-    checked = Scenario.from_mapping(parse(name, text), name)
+    checked = Scenario.from_mapping(parse(name, text), name, folder_of(scenario))
     write_text(to_json(checked.to_mapping()) if as_json else text, output)
 
 

@@ -149,6 +149,7 @@ def _least_agents(asked: Question, target: float, link: float, most: int) -> Age
 def with_agents(scenario: Scenario, agents: int) -> Scenario:
     """Return the same scenario with another number of like agents."""
     source = dict(scenario.source)
-    source["network"] = {**source.get("network", {}), "agents": agents}
-    network = replace(scenario.network, agents=agents)
+    given = {key: value for key, value in source.get("network", {}).items() if key != "nodes"}
+    source["network"] = {**given, "agents": agents}
+    network = replace(scenario.network, agents=agents, names=())
     return replace(scenario, network=network, sensor_of=(0,) * agents, source=source)

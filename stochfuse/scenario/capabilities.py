@@ -88,6 +88,10 @@ def _varies(system: System) -> bool:
     return system.model.varies or any(sensor.varies for sensor in system.sensors)
 
 
+def _unequal(system: System, links: LinkRows) -> bool:
+    return not links.uniform and system.network.hears is None
+
+
 FEATURES = (
     Feature("no-sensor", "[[agent]] sensor = false", lambda s, _: any(_blind(s)[k] for k in s.sensor_of)),
     Feature(
@@ -103,8 +107,8 @@ FEATURES = (
         "model.F, Q, H, R per step, model.step per step, or a sensor whose H follows the nominal path",
         lambda s, _: _varies(s),
     ),
-    Feature("unequal-links", "network.link as a matrix", lambda s, r: not r.uniform and s.network.hears is None),
-    Feature("links-per-step", "network.link per step", lambda s, r: r.varies),
+    Feature("unequal-links", "network.link as a matrix, network.radio", _unequal),
+    Feature("links-per-step", "network.link per step, network.radio with paths", lambda s, r: r.varies),
     Feature("masks", "network.hears", lambda s, _: s.network.hears is not None),
     Feature("cases", "[[network.case]]", lambda s, r: r.names is not None),
     Feature("delay", "network.delay", lambda s, _: s.network.delay != (1.0,)),

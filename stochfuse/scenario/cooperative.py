@@ -172,9 +172,11 @@ def _places(check: Checker, nodes: list[Any], coordinates: int, agents: int, ste
             expected = f"one [[agent]] table with a position for each of the {agents} agents"
             check.note("agent", expected, str(len(nodes)) if nodes else "nothing")
         return None
-    places = []
+    places, noted = [], {problem.path for problem in check.problems}
     for i, node in enumerate(nodes, start=1):
         path = f"agent[{i}].position"
+        if path in noted:
+            continue
         if node.get("position") is None:
             check.note(path, f"a list of {coordinates} numbers, since [cooperative] is given", "nothing")
         place = check.vector(path, node.get("position"), coordinates, steps)

@@ -28,11 +28,14 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from stochfuse.errors import StochfuseError, UsageError, nearest
+
+if TYPE_CHECKING:
+    from stochfuse.scenario.radio import Radio
 
 CONFIDENCE = 0.95
 MEMORY = 3.841458820694124
@@ -55,13 +58,18 @@ class Links:
     ----------
     source, kind : the file's name, and what it was taken for.
     nodes : names.
-    link : (receiver, sender) estimated probability; NaN where nothing is known, and on the diagonal.
+    link : (receiver, sender) estimated probability, or (steps, receiver, sender) where a scenario's vary; NaN where
+        nothing is known, and on the diagonal.
     low, high : the same, ends of the 95 % interval; NaN where no number of packets is known.
     sent, received : the same, numbers of packets; None where only ratios are known.
     memory : the same, likelihood ratio for memory; None where packets have no order.
     burst : fitted two-state models, by (receiver, sender) from 0, where a link has memory.
     delay : probabilities of 0, 1, … steps, or None.
     notes : what the reader should know.
+    architecture, steps : of a scenario; the least that a log says.
+    places : of a scenario's agents, (D,) or (steps, D) in m each; empty where they are not given.
+    radio : what a scenario's links come from, or None.
+    cases : a scenario's named alternatives, each an array like `link`.
     """
 
     source: str
@@ -76,12 +84,27 @@ class Links:
     burst: Mapping[tuple[int, int], Mapping[str, float]] | None = None
     delay: tuple[float, ...] | None = None
     notes: tuple[str, ...] = ()
+    architecture: str = "ad-hoc"
+    steps: int | None = None
+    places: tuple[np.ndarray, ...] = ()
+    radio: Radio | None = None
+    cases: tuple[tuple[str, np.ndarray], ...] = ()
+
+    @property
+    def varies(self) -> bool:
+        """Whether the links depend on the step."""
+        return self.link.ndim == 3
+
+    @property
+    def moves(self) -> bool:
+        """Whether some agent is on its way."""
+        return any(place.ndim == 2 for place in self.places)
 
     @property
     def unknown(self) -> list[tuple[str, str]]:
         """Receiver and sender of links of which nothing is known."""
         off = ~np.eye(len(self.nodes), dtype=bool)
-        return [(self.nodes[i], self.nodes[j]) for i, j in np.argwhere(np.isnan(self.link) & off)]
+        return [(self.nodes[i], self.nodes[j]) for i, j in np.argwhere(np.isnan(self.link) & off)[:, -2:]]
 
     def of(self, nodes: Sequence[str]) -> Links:
         """Return the links between some of the nodes, in that order.
@@ -101,7 +124,7 @@ class Links:
         burst = self.burst and {
             (places.index(i), places.index(j)): fit for (i, j), fit in self.burst.items() if {i, j} <= set(places)
         }
-        square = np.ix_(places, places)
+        square = (..., *np.ix_(places, places))
         counts = (None if M is None else M[square] for M in (self.sent, self.received, self.memory))
         sent, received, memory = counts
         return replace(
@@ -114,32 +137,9 @@ class Links:
             received=received,
             memory=memory,
             burst=burst or None,
+            places=tuple(self.places[i] for i in places) if self.places else (),
+            cases=tuple((name, link[square]) for name, link in self.cases),
         )
-
-
-def links(source: Any, **how: Any) -> Links:
-    """Return what is known of links: from a file, or from a packet log as a DataFrame or a mapping of columns.
-
-    Parameters
-    ----------
-    source : a path, see `read_links`; or columns, see `links_of_packets`.
-    **how : columns, sent, step of a file; step of a log.
-
-    Raises
-    ------
-    UsageError
-        If it is none of these; with line and column.
-
-    Examples
-    --------
-    >>> import stochfuse as sf
-    >>> log = {"seq": [1, 2, 3], "sender": ["a"] * 3, "receiver": ["b"] * 3, "received": [1, 0, 1]}
-    >>> float(sf.links(log).link[1, 0].round(3))
-    0.667
-    """
-    if isinstance(source, str | Path):
-        return read_links(source, **how)
-    return links_of_packets(source, **how)
 
 
 def read_links(

@@ -14,10 +14,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from stochfuse.errors import UsageError
+
+if TYPE_CHECKING:
+    from stochfuse.scenario.radio import Radio
 
 ARCHITECTURES = ("ad-hoc", "broadcast", "cyclic")
 DEFAULT_LINKS = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -40,6 +44,9 @@ class Network:
     burst : (4,) good→bad, bad→good, delivery in good, delivery in bad; None for links without memory.
     case_bursts : the same for each of the cases.
     hears : (n, n) whether agent i may hear agent j, or None where all may hear whom the architecture lets them hear.
+    names : names of the agents; empty where they have none but their numbers.
+    places : of every agent (D,) or (steps, D), in m; empty where they are not given.
+    radio : what the link probabilities come from, with the places; None where they are given.
     """
 
     agents: int
@@ -51,6 +58,9 @@ class Network:
     burst: np.ndarray | None = None
     case_bursts: tuple[np.ndarray | None, ...] = ()
     hears: np.ndarray | None = None
+    names: tuple[str, ...] = ()
+    places: tuple[np.ndarray, ...] = ()
+    radio: Radio | None = None
     delays: tuple[tuple[tuple[float, ...], ...], ...] | None = None
     counts: tuple[np.ndarray, np.ndarray] | None = None
 

@@ -5,7 +5,8 @@
                  or kind, step, noise (`stochfuse.scenario.motion`), sensor (`stochfuse.scenario.sensing`)
     [initial]    P, correlation = "independent" | "shared", optional x and error (a known initial bias)
     [network]    agents, steps, architecture, link = number | matrix | one of either per step, optional delay, case
-    [[agent]]    optional, for unlike agents: its own H, R, or a sensor by name at its position
+    [network.radio]  instead of link: a link budget, which gives it with the agents' positions
+    [[agent]]    optional, for unlike agents: its own H, R, or a sensor by name; name and position
 
 Step 1 holds the agents' initial estimates and the first exchange: nothing is predicted or measured before it (thesis
 3.1).  With correlation = "independent" the initial errors are the agents' own, so that nothing is shared at step 1;
@@ -40,7 +41,7 @@ from stochfuse.scenario.tables import read_filters, read_link, read_model, read_
 
 SCHEMA = "stochfuse.scenario/1"
 DEFAULT = "thesis-transient"
-LINK_KEYS = ("link", "sent", "received", "case", "burst")
+LINK_KEYS = ("link", "radio", "sent", "received", "case", "burst")
 CORRELATIONS = ("independent", "shared")
 _PRESETS = Path(__file__).parent / "presets"
 
@@ -125,7 +126,7 @@ class Scenario:
         """
         from stochfuse.scenario.schema import structure_problems
 
-        mapping = _with_links(as_file(mapping, name), name, folder)
+        mapping = with_links(as_file(mapping, name), name, folder)
         return _build(mapping, name, structure_problems(mapping))
 
     def until(self, step: int) -> Scenario:
@@ -182,10 +183,10 @@ def load_scenario(source: str | Path | Mapping[str, Any] = DEFAULT, **overrides:
     source : a preset's name, a TOML or JSON file's path, "-" for standard input, or a mapping with a file's keys, whose
         lists and numbers may be NumPy's.
     **overrides : agents, steps, architecture, q, r, p0: numbers that take the place of network.agents, network.steps,
-        network.architecture, model.Q, model.R and initial.P; `uniform_link=True` drops the file's link and cases, for a
-        caller who gives the link probability.  For a state of several dimensions a number is that multiple of the
-        identity.  Of a model with a kind q is its noise: the density, or the square of the standard deviation; of a
-        sensor by name (model.sensor) r is the square of sigma.
+        network.architecture, model.Q, model.R and initial.P; `uniform_link=True` drops the file's link, radio, burst
+        and cases, for a caller who gives the link probability.  For a state of several dimensions a number is that
+        multiple of the identity.  Of a model with a kind q is its noise: the density, or the square of the standard
+        deviation; of a sensor by name (model.sensor) r is the square of sigma.
 
     Raises
     ------
@@ -212,10 +213,10 @@ def load_scenario(source: str | Path | Mapping[str, Any] = DEFAULT, **overrides:
     if is_preset(source):
         # the presets' structure is checked by the tests; pydantic would double the time of a plain `predict`
         return _build(mapping, name, [])
-    return Scenario.from_mapping(mapping, name, _folder(source))
+    return Scenario.from_mapping(mapping, name, folder_of(source))
 
 
-def _with_links(mapping: Any, name: str, folder: Path) -> Any:
+def with_links(mapping: Any, name: str, folder: Path) -> Any:
     """The mapping with the link probabilities of a file in the place of its name.
 
     Raises
@@ -229,7 +230,7 @@ def _with_links(mapping: Any, name: str, folder: Path) -> Any:
         return mapping
     from stochfuse.scenario.links import read_links
 
-    nodes, agents = network.get("nodes"), network.get("agents")
+    nodes, agents = network.get("nodes") or _all_names(mapping.get("agent")), network.get("agents")
     try:
         found = read_links(folder / given["file"])
         found = found.of([str(node) for node in nodes]) if isinstance(nodes, list) else found
@@ -255,13 +256,22 @@ def _with_links(mapping: Any, name: str, folder: Path) -> Any:
     return {**mapping, "network": made}
 
 
+def _all_names(tables: Any) -> list[str] | None:
+    """Names of [[agent]] tables that all have one."""
+    listed = tables if isinstance(tables, list) else []
+    given = [table.get("name") for table in listed if isinstance(table, Mapping)]
+    names = [name for name in given if isinstance(name, str)]
+    return names if names and len(names) == len(listed) else None
+
+
 def checked_scenario(source: str | Path) -> Scenario:
     """Read a scenario with every check, presets included; see `load_scenario`."""
     name, text = read_text(source)
-    return Scenario.from_mapping(parse(name, text), name, _folder(source))
+    return Scenario.from_mapping(parse(name, text), name, folder_of(source))
 
 
-def _folder(source: str | Path) -> Path:
+def folder_of(source: str | Path) -> Path:
+    """What paths of files in a scenario are relative to."""
     return Path() if source == "-" or is_preset(source) else Path(source).parent
 
 
@@ -460,7 +470,7 @@ def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> S
     tables = {key: mapping[key] if isinstance(mapping.get(key), dict) else {} for key in names}
     agents, initial = mapping.get("agent"), tables["initial"]
     agents = agents if isinstance(agents, list) else None
-    network = read_network(check, tables["network"])
+    network = read_network(check, tables["network"], agents)
     own = tables["model"].get("own") is True
     if isinstance(mapping.get("navigation"), dict):
         (model, P0), default = _navigation(check, mapping, network), None
@@ -550,8 +560,9 @@ def _relations(
     """What agents measure of each other."""
     agents = mapping.get("agent")
     tables = [table for table in agents if isinstance(table, dict)] if isinstance(agents, list) else []
-    placed = not by_name(mapping) and any("position" in table for table in tables)
-    if "cooperative" not in mapping and not placed:
+    if "cooperative" not in mapping and not (
+        own and not by_name(mapping) and any("position" in table for table in tables)
+    ):
         if own:
             check.note("cooperative", "what agents with states of their own measure of each other", "nothing")
         return {}

@@ -212,6 +212,22 @@ class LinkFile(StrictTable):
     file: str = Field(description="its path, relative to the scenario file; see `stochfuse links`")
 
 
+class RadioTable(StrictTable):
+    """A radio link's budget: with the agents' places it gives the link probabilities."""
+
+    transmit_power: Real = Field(description="dBm")
+    gain: Real = Field(0.0, description="antenna gains of both ends, less what cables take, dB")
+    exponent: Real = Field(2.0, description="of the path loss over distance; 2 in free space")
+    reference_distance: Real = Field(1.0, description="m; nearer than that the loss is the reference loss")
+    reference_loss: Real = Field(description="path loss at the reference distance, dB")
+    sensitivity: Real = Field(description="least power that a receiver can read, dBm")
+    fading: Literal["none", "rayleigh", "shadowing"] = Field(
+        "none",
+        description="none: all or nothing; rayleigh: block fading, drawn for each message; shadowing: log-normal",
+    )
+    shadowing: Real | None = Field(None, description="standard deviation of log-normal shadowing, dB")
+
+
 class NetworkTable(StrictTable):
     """Who may hear whom, and how likely."""
 
@@ -227,6 +243,9 @@ class NetworkTable(StrictTable):
         None, description="packets sent on each link (row: receiver, column: sender), behind link or instead of it"
     )
     received: list[list[Number]] | None = Field(None, description="packets of these that were received")
+    radio: RadioTable | None = Field(
+        None, description="link probabilities from a link budget and every agent's position, instead of link"
+    )
     nodes: list[str] | None = Field(None, description="names of the agents in order: which nodes of a file they are")
     burst: BurstTable | None = Field(None, description="bursty links, instead of a link probability")
     hears: list[list[int]] | None = Field(
@@ -243,6 +262,7 @@ class NetworkTable(StrictTable):
 class AgentTable(StrictTable):
     """One agent's own sensor, filter and place, where they differ from the model's."""
 
+    name: str | None = Field(None, description="name of the agent, its own; default: its number")
     H: Matrix | None = None
     R: Matrix | None = None
     sensor: SensorChoice = Field(
@@ -254,7 +274,9 @@ class AgentTable(StrictTable):
     M: Matrix | None = Field(None, description="mapping of a parallel filter's state into the state, x = M x_i + s")
     s: Vector | None = Field(None, description="offset of that mapping, default zero")
     position: Vector | None = Field(
-        None, description="place of a sensor by name, or nominal place for cooperative measurements, or one per step, m"
+        None,
+        description="place in m, or one per step: of a sensor by name, for network.radio, and the nominal place for "
+        "cooperative measurements",
     )
 
 

@@ -15,14 +15,15 @@ from stochfuse.scenario.checker import Checker
 from stochfuse.scenario.model import Filter, Model, Noise, Sensor
 from stochfuse.scenario.motion import read_motion, read_step, refuse_keys_of_kinds
 from stochfuse.scenario.network import ARCHITECTURES, Network, mean_delivery, possible_senders
+from stochfuse.scenario.radio import links_between, read_places, read_radio
 from stochfuse.scenario.sensing import sometimes
 
 MOST_DELAY = 10_000
 """Largest delay of a message, in steps."""
 
 
-def read_network(check: Checker, table: Mapping[str, Any]) -> Network | None:
-    """Read [network]; None where something essential is wrong, which the checker has noted."""
+def read_network(check: Checker, table: Mapping[str, Any], agent_tables: Sequence[Any] | None = None) -> Network | None:
+    """Read [network], names and places from [[agent]]; None where something essential is wrong, which is noted."""
     agents = check.integer("network.agents", table.get("agents"), 1)
     steps = check.integer("network.steps", table.get("steps"), 1)
     architecture = check.choice("network.architecture", table.get("architecture", "ad-hoc"), ARCHITECTURES)
@@ -35,6 +36,13 @@ def read_network(check: Checker, table: Mapping[str, Any]) -> Network | None:
     if counts is not None and given is None:
         given = _ratios(check, *counts, table.get("hears"))
     link = read_link(check, "network.link", given, agents, steps, architecture)
+    radio = read_radio(check, table.get("radio"))
+    places = read_places(check, agent_tables, agents, steps, needed=table.get("radio") is not None)
+    if table.get("radio") is not None and table.get("link") is not None:
+        check.note("network.radio", "either a link probability or a radio", "both")
+    elif radio is not None and places:
+        link = links_between(radio, places)
+        _check_broadcast(check, "network.radio", link, agents, architecture)
     burst = _burst(check, "network", table)
     link = link if burst is None else mean_delivery(burst)
     cases, bursts = [], []
@@ -53,7 +61,7 @@ def read_network(check: Checker, table: Mapping[str, Any]) -> Network | None:
         check.name(f"network.case[{i}].name", name)
         if name in [other for other, _ in cases]:
             check.note(f"network.case[{i}].name", "a name of its own", shown(name))
-        if own is None and case.get("link") is None and case.get("burst") is None:
+        if own is None and all(where is None for where in (case.get("link"), case.get("burst"), table.get("radio"))):
             check.note(path, "a link probability here or in network.link", "nothing")
         elif own is not None:
             cases.append((name, own))
@@ -62,7 +70,23 @@ def read_network(check: Checker, table: Mapping[str, Any]) -> Network | None:
     hears = _hears(check, table.get("hears"), agents, architecture)
     if hears is not None and any(b is not None for b in (burst, *bursts)):
         check.note("network.hears", "links without memory (no burst)", "a burst")
-    return Network(agents, steps, architecture, link, tuple(cases), delay, burst, tuple(bursts), hears, delays, counts)
+    names = _agent_names(check, table.get("nodes"), agent_tables, agents)
+    return Network(
+        agents=agents,
+        steps=steps,
+        architecture=architecture,
+        link=link,
+        cases=tuple(cases),
+        delay=delay,
+        burst=burst,
+        case_bursts=tuple(bursts),
+        hears=hears,
+        names=names,
+        places=places,
+        radio=radio,
+        delays=delays,
+        counts=counts,
+    )
 
 
 def _counts(check: Checker, table: Mapping[str, Any], agents: int) -> tuple[np.ndarray, np.ndarray] | None:
@@ -96,6 +120,29 @@ def _ratios(check: Checker, sent: np.ndarray, received: np.ndarray, hears: Any) 
     return np.divide(received, sent, out=np.zeros_like(sent), where=sent > 0).tolist()
 
 
+def _agent_names(check: Checker, nodes: Any, tables: Sequence[Any] | None, agents: int) -> tuple[str, ...]:
+    """Names of the agents from network.nodes and [[agent]], which must not differ; empty where there are none."""
+    given = enumerate((table.get("name") if isinstance(table, dict) else None for table in tables or ()), start=1)
+    own = {i: name for i, name in given if isinstance(name, str)}
+    if not isinstance(nodes, list):
+        named = [(f"agent[{i}].name", own.get(i, str(i))) for i in range(1, agents + 1)] if own else []
+    elif len(nodes) != agents:
+        check.note("network.nodes", f"{agents} names, one for each agent", str(len(nodes)))
+        return ()
+    else:
+        named = [(f"network.nodes[{i}]", str(node)) for i, node in enumerate(nodes, start=1)]
+        for i, name in own.items():
+            if i <= agents and name != nodes[i - 1]:
+                check.note(f"agent[{i}].name", f"'{nodes[i - 1]}' as in network.nodes, or nothing", shown(name))
+    seen: set[str] = set()
+    for path, name in named:
+        check.name(path, name)
+        if not name.strip() or name in seen:
+            check.note(path, "a name of its own" if name.strip() else "a name, not empty", shown(name))
+        seen.add(name)
+    return tuple(name for _, name in named)
+
+
 def _hears(check: Checker, value: Any, agents: int, architecture: str) -> np.ndarray | None:
     if not isinstance(value, list):
         return None
@@ -119,8 +166,9 @@ def _burst(check: Checker, path: str, table: Mapping[str, Any]) -> np.ndarray | 
     if not isinstance(given, dict):
         return None
     path = f"{path}.burst"
-    if table.get("link") is not None:
-        check.note(path, "either a link probability or a burst", "both")
+    if table.get("link") is not None or table.get("radio") is not None:
+        what = "a link probability" if table.get("link") is not None else "a radio"
+        check.note(path, f"either {what} or a burst", "both")
     keys = {"good_to_bad": None, "bad_to_good": None, "good": 1.0, "bad": 0.0}
     values = []
     for key, default in keys.items():
@@ -154,9 +202,10 @@ def _check_broadcast(check: Checker, path: str, link: np.ndarray | None, agents:
         with np.errstate(invalid="ignore"):
             uneven = agents > 2 and (np.nanmax(others, axis=-2) != np.nanmin(others, axis=-2)).any()
         if uneven:
-            check.note(
-                path, "equal probabilities in each column (a broadcast is heard by all or by none)", "unequal ones"
-            )
+            expected = "equal probabilities in each column (a broadcast is heard by all or by none)"
+            if path == "network.radio":
+                expected += ', or network.architecture "ad-hoc"'
+            check.note(path, expected, "unequal ones")
 
 
 Delay = tuple[float, ...]

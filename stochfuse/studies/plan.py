@@ -414,6 +414,10 @@ def default_method(scenario: Scenario, given: set[str]) -> str:
     return MONTE_CARLO if "runs" in given else GENERAL if "estimator" in given else SIMPLIFIED
 
 
+_LIKELIHOODS = ("link", "burst", "radio")
+"""Keys of [network] that say how likely messages are."""
+
+
 def put(mapping: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
     """Return a scenario's mapping with values at paths, `network.link` or `agent[2].R`, less what they replace."""
     found = json.loads(json.dumps(mapping))
@@ -425,13 +429,13 @@ def put(mapping: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]
         if not isinstance(place, dict) or not isinstance(last, str):
             raise _nowhere(path)
         place[last] = value
-        # a link probability takes the place of everything else that says how likely messages are
-        if path == "network.link":
-            for other in ("case", "burst"):
-                place.pop(other, None)
-        elif path.startswith("network.burst"):
-            found["network"].pop("link", None)
-            found["network"].pop("case", None)
+        # what says how likely messages are takes the place of everything else that does
+        table, _, key = path.partition(".")
+        key = key.partition(".")[0]
+        if table == "network" and key in _LIKELIHOODS:
+            for other in (*_LIKELIHOODS, "case"):
+                if other != key:
+                    found["network"].pop(other, None)
     return found
 
 

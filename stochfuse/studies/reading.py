@@ -43,7 +43,7 @@ from stochfuse.prediction.quantities import QUANTITIES
 from stochfuse.prediction.quantities import check as check_quantity
 from stochfuse.scenario.checker import Checker
 from stochfuse.scenario.registry import CRITERIA, ESTIMATORS, METHODS
-from stochfuse.scenario.scenario import Scenario, is_preset, parse, read_file, read_text
+from stochfuse.scenario.scenario import Scenario, folder_of, is_preset, parse, read_file, read_text, with_links
 from stochfuse.scenario.schema import problems_of, structure_problems
 from stochfuse.studies.plan import EXPECTED, KEY, MESSAGES, SETTINGS, Axis, Plan, StudyFile, put, read_axes
 
@@ -97,8 +97,11 @@ def _resolved(name: str, mapping: Mapping[str, Any], folder: Path) -> Plan:
         except ScenarioError as error:
             raise ScenarioError(name, [Problem("scenario", "a scenario", str(error))]) from None
         scenario_name = scenario if is_preset(scenario) else Path(scenario).name
+        folder = folder_of(inside)
     else:
         base, scenario_name = scenario, "its own scenario"
+    # workers read no files: what a file says of the links goes into the record
+    base = with_links(base, name, folder)
     resolved = {k: v for k, v in mapping.items() if k not in ("schema", "description")}
     record = {
         "name": Path(name).name,

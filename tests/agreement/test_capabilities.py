@@ -80,6 +80,32 @@ def test_each_pair_of_features(estimator, engine):
     assert found.count("impossible") < 60
 
 
+@pytest.mark.parametrize(("estimator", "engine"), PAIRS)
+@pytest.mark.parametrize("features", [("several-states",), ("own-states",)])
+def test_a_radio_is_taken_as_its_matrices_are(estimator, engine, features):
+    source = featured.source(features)
+    del source["network"]["link"]
+    source["network"]["radio"] = {
+        "transmit_power": 20, "reference_loss": 80, "sensitivity": -85, "fading": "rayleigh", "exponent": 3,
+    }  # fmt: skip
+    source.setdefault("agent", [{} for _ in range(source["network"]["agents"])])
+    for i, table in enumerate(source["agent"]):
+        table["position"] = [[4.0 * i, 2.0], [7.0 * i, 3.0]]
+    made = sf.Scenario.from_mapping(source)
+    assert {"links-per-step", "unequal-links"} <= set(capabilities.features_of(made.system, link_rows(made)))
+    short = -85 - 20 + 80 + 30 * np.log10([[[4.0]], [[7.0]]])
+    link = np.exp(-(10.0 ** (short / 10))) * np.ones((2, 2))
+    other = {key: value for key, value in source["network"].items() if key != "radio"}
+    matrices = sf.Scenario.from_mapping({**source, "network": {**other, "link": link.tolist()}})
+    how = asked(estimator, engine)
+    refused = refusal(lambda: sf.predict(made, **how))
+    assert refused == refusal(lambda: sf.predict(matrices, **how))
+    if not refused:
+        np.testing.assert_allclose(
+            sf.predict(made, **how).covariance, sf.predict(matrices, **how).covariance, rtol=1e-13, atol=1e-15
+        )
+
+
 def test_a_refusal_names_the_feature_and_what_takes_it():
     delayed = scenario("delay")
     with pytest.raises(
