@@ -1,6 +1,6 @@
 """Whether the recursion of (54) stays bounded, with a certificate either way.
 
-Of P ↦ g(P) = Σ p_S update(F P Fᵀ + Q, what the set S of sensors shows) only what large P do matters.  Since g is concave,
+Of g(P) = Σ p_S update(F P Fᵀ + Q, what the set S of sensors shows) only what large P do matters.  Since g is concave,
 
     ĝ(X) = lim g(tX)/t = Σ p_S short_S(F X Fᵀ),    g(P + X) ⪰ g(P) + ĝ(X)
 
@@ -19,9 +19,9 @@ Exactly one of these holds, and each is proved by what it names:
   steps; for λ = 1, too, it grows if the process noise reaches X, by g(0) in every step.
 
 For if there is no such P, Y ← ĝ(Y) + I from 0 increases without end, ĝ(Y) ⪰ Y − I along it, and Y/‖Y‖ has a limit
-X with ĝ(X) ⪰ X (ĝ, a minimum of continuous maps, jumps only upwards in a limit).  This is the linear matrix inequality of Sinopoli et
-al. 2004, theorem 5, for any number of sensors; with one sensor of one component its threshold is 1 − Π|λᵢ|⁻² over
-the unstable modes, with one that shows the state 1 − max|λᵢ|⁻².
+X with ĝ(X) ⪰ X (ĝ, a minimum of continuous maps, jumps only upwards in a limit).  This is the linear matrix
+inequality of Sinopoli et al. 2004, for any number of sensors; with one sensor of one component its threshold is
+1 − Π|λᵢ|⁻² over the unstable modes, with one that shows the state 1 − max|λᵢ|⁻².
 
 The gains are found by policy iteration for the least spectral radius ρ(L_K): X = (ρ(1+ε) − L_K)⁻¹I, K ← the best for X.
 
@@ -33,6 +33,7 @@ matrix's size: such a certificate holds for a scenario within rounding of the on
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -48,8 +49,11 @@ ROUNDING = 1e-13
 STRUCTURE = 1e-10
 """Share of a matrix's size below which an entry is zero by structure."""
 ITERATIONS = 60
+"""Of the policy iteration, at most: it takes three to ten."""
 SLACK = 1e-9
 """ε of the policy iteration: its spectral radius is the least one up to the square of this."""
+SMALL = 1e-3
+"""Spectral radius below which a better one is not looked for: it is enough to be below 1."""
 GAP = 0.1
 """Share of the size before it below which an eigenvalue may begin the null space of a direction of growth."""
 NEGLIGIBLE = 1e-8
@@ -59,15 +63,16 @@ RIDGE = 1e-14
 
 
 class Recursion(NamedTuple):
-    """One receiver's recursion, in units of the states' deviations, its outcomes merged by what they show.
+    """One receiver's recursion in coordinates z of its own, its outcomes merged by what they show.
 
     Parameters
     ----------
     F, Q : (d, d) transition and process noise.
-    H : (outcomes, d, d) an orthonormal basis of what each outcome shows, and rows of zeros.
+    H : (outcomes, d, d) a basis of what each outcome shows, and rows of zeros.
     R : (outcomes, d, d) noise of those rows, at most; 1 in the rows of zeros.
     p : (outcomes,) probabilities.
-    unit : (d,) the units.
+    T : (d, d) the state is x = T z; to begin with the states' deviations.
+    doubt : by how much more than rounding F may be wrong.
     """
 
     F: np.ndarray
@@ -75,7 +80,12 @@ class Recursion(NamedTuple):
     H: np.ndarray
     R: np.ndarray
     p: np.ndarray
-    unit: np.ndarray
+    T: np.ndarray
+    doubt: float = 1.0
+
+    def covariance(self, P: np.ndarray) -> np.ndarray:
+        """Return the covariance of x from that of z."""
+        return self.T @ P @ self.T.T
 
 
 class Bounded(NamedTuple):
@@ -121,7 +131,7 @@ def recursions(case: Case | UnlikeCase) -> list[Recursion]:
     p = np.zeros((len(H), case.items))
     np.add.at(p, of, weights)
     F, Q = F * unit / unit[:, None], Q / np.outer(unit, unit)
-    return [Recursion(F, Q, H[q > 0], R[q > 0], q[q > 0], unit) for q in p.T]
+    return [Recursion(F, Q, H[q > 0], R[q > 0], q[q > 0], np.diag(unit)) for q in p.T]
 
 
 @lru_cache(maxsize=32)
@@ -230,8 +240,20 @@ def decide(of: Recursion, gains: np.ndarray | None = None) -> tuple[float, np.nd
         if not ρ < least * (1.0 - 1e-14):
             break
         least, found = ρ, K
-        K = _best(of, _resolvent(L, max(ρ * (1.0 + SLACK), 1e-3), np.eye(d)))
+        X = _over(L, ρ, d)
+        if X is None:
+            break
+        K = _best(of, X)
     return least, found
+
+
+def _over(L: np.ndarray, ρ: float, d: int) -> np.ndarray | None:
+    """(λ − L)⁻¹I for a λ just above the spectral radius, which is known as well as rounding lets it be; or None."""
+    for slack in (SLACK, 1e-6, 1e-3):
+        X = _resolvent(L, max(ρ * (1.0 + slack), SMALL), np.eye(d))
+        if X is not None and _least(X, X) > 0:
+            return X
+    return None
 
 
 def _best(of: Recursion, X: np.ndarray) -> np.ndarray:
@@ -253,10 +275,14 @@ def _linear(of: Recursion, K: np.ndarray) -> np.ndarray:
     return full[rows * d + columns] @ basis(d).reshape(-1, d * d).T
 
 
-def _resolvent(L: np.ndarray, λ: float, W: np.ndarray) -> np.ndarray:
-    """(λ − L)⁻¹W."""
+def _resolvent(L: np.ndarray, λ: float, W: np.ndarray) -> np.ndarray | None:
+    """(λ − L)⁻¹W, or None where it is beyond rounding."""
     rows, columns, place = triangle(len(W))
-    return np.linalg.solve(λ * np.eye(len(L)) - L, W[rows, columns])[place]
+    try:
+        X = np.linalg.solve(λ * np.eye(len(L)) - L, W[rows, columns])[place]
+    except np.linalg.LinAlgError:
+        return None
+    return X if np.isfinite(X).all() else None
 
 
 def stable(of: Recursion, gains: np.ndarray) -> bool:
@@ -279,16 +305,40 @@ def bounded(of: Recursion, gains: np.ndarray) -> Bounded | None:
     N = _after(of, gains, np.zeros_like(X)) / np.sqrt(np.outer(np.diagonal(W), np.diagonal(W)))
     P = 2.0 * max(float(np.linalg.eigvalsh(N).max()), 1.0) * X
     margin = _least(P - _after(of, gains, P), P)
-    return Bounded(P * np.outer(of.unit, of.unit), gains, margin) if margin >= ROUNDING else None
+    return Bounded(of.covariance(P), gains, margin) if margin >= ROUNDING * of.doubt else None
+
+
+def conditioned(of: Recursion, gains: np.ndarray) -> Recursion | None:
+    """Return the recursion in coordinates in which large covariances are no longer than broad; None if they are so.
+
+    What grows in a direction that is shown but faintly is much larger along it than across, and proofs in units of the
+    states' deviations then have less to stand on than rounding.
+    """
+    X = _dominant(of, gains)
+    variance = np.maximum(np.diagonal(X), NEGLIGIBLE**2 * np.diagonal(X).max())
+    if variance.min() < 1e-2 * variance.max():
+        # powers of two: nothing is rounded, and what is zero stays so
+        return rebased(of, np.diag(np.exp2(np.rint(0.5 * np.log2(variance)))))
+    size, V = np.linalg.eigh(X)
+    there = size[size > NEGLIGIBLE * size.max()]
+    if there.min() > 1e-3 * there.max():
+        return None
+    return rebased(of, V * np.sqrt(np.maximum(size, 0.1 * there.min()) / there.max()))
+
+
+def rebased(of: Recursion, C: np.ndarray) -> Recursion:
+    """Return the recursion in other coordinates, z = C (new z)."""
+    back = np.linalg.inv(C)
+    F = back @ of.F @ C
+    turned = np.count_nonzero(C) > len(C)
+    doubt = np.linalg.norm(np.abs(back) @ np.abs(of.F) @ np.abs(C)) / np.linalg.norm(F) if turned else 1.0
+    return of._replace(F=F, Q=back @ of.Q @ back.T, H=of.H @ C, T=of.T @ C, doubt=of.doubt * max(float(doubt), 1.0))
 
 
 def _below(L: np.ndarray, W: np.ndarray) -> np.ndarray | None:
     """X ≻ 0 with X − L(X) = W, or None."""
-    try:
-        X = _resolvent(L, 1.0, W)
-    except np.linalg.LinAlgError:
-        return None
-    return X if np.isfinite(X).all() and (np.diagonal(X) > 0).all() and _least(X, X) > 0 else None
+    X = _resolvent(L, 1.0, W)
+    return X if X is not None and _least(X, X) > 0 else None
 
 
 def _after(of: Recursion, K: np.ndarray, P: np.ndarray) -> np.ndarray:
@@ -299,39 +349,53 @@ def _after(of: Recursion, K: np.ndarray, P: np.ndarray) -> np.ndarray:
 
 def _least(D: np.ndarray, P: np.ndarray) -> float:
     """Smallest eigenvalue of D in units of the deviations of P."""
-    sd = np.sqrt(np.diagonal(P))
-    return float(np.linalg.eigvalsh(D / np.outer(sd, sd)).min()) if (sd > 0).all() else -np.inf
+    variance = np.diagonal(P)
+    if not (variance > 0).all():
+        return -np.inf
+    sd = np.sqrt(variance)
+    return float(np.linalg.eigvalsh(D / np.outer(sd, sd)).min())
 
 
 def growing(of: Recursion, gains: np.ndarray) -> Growing | None:
     """Return a proof that a recursion has no bound, from the best gains; None if none is found."""
-    size, V = np.linalg.eigh(_dominant(of, gains))
-    size, V = size[::-1], V[:, ::-1]
-    d = len(size)
-    for rank in range(1, d + 1):
-        if rank < d and size[rank] > GAP * size[rank - 1]:
-            continue
-        there = np.linalg.norm(V[:, :rank], axis=1) > NEGLIGIBLE
+    for V in _directions(of, gains):
+        there = np.linalg.norm(V, axis=1) > NEGLIGIBLE
         if of.F[np.ix_(~there, there)].any():
             there[:] = True
-        found = _on_subspace(of, there, V[there, :rank])
+        found = _on_subspace(of, there, V[there])
         if found is not None:
-            return Growing(found[0] * np.outer(of.unit, of.unit), rank, found[1])
+            return Growing(of.covariance(found[0]), V.shape[1], found[1])
     return None
+
+
+def _directions(of: Recursion, gains: np.ndarray) -> Iterator[np.ndarray]:
+    """Bases of nearly invariant subspaces of F in which something may grow: of what grows most, and single modes."""
+    size, V = np.linalg.eigh(_dominant(of, gains))
+    size, V = size[::-1], V[:, ::-1]
+    for rank in range(1, len(size) + 1):
+        if rank == len(size) or size[rank] <= GAP * size[rank - 1]:
+            yield V[:, :rank]
+    for eigenvalue, w in zip(*_eigen(of.F), strict=True):
+        unseen = np.abs(of.H @ w).max(axis=1) < STRUCTURE
+        if eigenvalue.imag >= 0 and of.p[unseen].sum() * abs(eigenvalue) ** 2 > 1.0:
+            parts = [w.real, w.imag] if eigenvalue.imag > 0 else [w.real]
+            yield np.linalg.qr(np.stack(parts, axis=1))[0]
 
 
 def _dominant(of: Recursion, gains: np.ndarray) -> np.ndarray:
     """X that L_K multiplies by its spectral radius, by inverse iteration from I; trace 1."""
     L = _linear(of, gains)
-    λ = float(np.abs(np.linalg.eigvals(L)).max()) * (1.0 + 1e-9)
+    λ = max(float(np.abs(np.linalg.eigvals(L)).max()) * (1.0 + SLACK), SMALL)
     X = np.eye(len(of.F))
     for _ in range(3):
-        X = _resolvent(L, λ, X)
-        X /= np.trace(X)
+        further = _resolvent(L, λ, X)
+        if further is None:
+            break
+        X = further / np.trace(further)
     return X
 
 
-def _invariant(F: np.ndarray, V: np.ndarray) -> tuple[np.ndarray, float]:
+def _invariant(F: np.ndarray, V: np.ndarray, doubt: float) -> tuple[np.ndarray, float]:
     """Orthonormal basis of the invariant subspace of F next to one that is nearly so, and how far it may be off.
 
     By Newton's method; the error is that of F V = V A over the separation of A from the rest of F (Stewart 1973).
@@ -339,7 +403,7 @@ def _invariant(F: np.ndarray, V: np.ndarray) -> tuple[np.ndarray, float]:
     d, r = V.shape
     if r == d:
         return np.eye(d), 0.0
-    size = np.linalg.norm(F)
+    size, separation = float(np.linalg.norm(F)), np.inf
     for _ in range(4):
         U = np.linalg.qr(np.concatenate([V, np.eye(d)], axis=1))[0]
         turned = U.T @ F @ U
@@ -349,21 +413,19 @@ def _invariant(F: np.ndarray, V: np.ndarray) -> tuple[np.ndarray, float]:
             return V, np.inf
         step = np.linalg.solve(slope, -turned[r:, :r].ravel()).reshape(-1, r)
         V = np.linalg.qr(U[:, :r] + U[:, r:] @ step)[0]
-    left = np.linalg.norm(F @ V - V @ (V.T @ F @ V)) + 1e-15 * d * size
+    left = np.linalg.norm(F @ V - V @ (V.T @ F @ V)) + 1e-15 * d * size * doubt
     return V, 2.0 * left / separation
 
 
 def _on_subspace(of: Recursion, there: np.ndarray, V: np.ndarray) -> tuple[np.ndarray, float] | None:
     """X = V M Vᵀ in some of the states, which F does not leave, and λ ≥ 1 with ĝ(X) ⪰ λX; or None."""
     F = of.F[np.ix_(there, there)]
-    V, off = _invariant(F, V)
+    V, off = _invariant(F, V, of.doubt)
     A = V.T @ F @ V
     H, shown = _restricted(of.H[:, :, there], V)
-    part = Recursion(A, A, H, np.zeros_like(H), of.p, np.ones(len(A)))
-    K = decide(part)[1]
-    for _ in range(2):
-        M = _dominant(part, K)
-        K = _best(part, M)
+    part = Recursion(A, A, H, np.zeros_like(H), of.p, V)
+    M = _dominant(part, decide(part)[1])
+    M = _dominant(part, _best(part, M)) if _least(M, M) > ROUNDING else M
     if not _least(M, M) > ROUNDING:
         return None
     sd = np.sqrt(np.diagonal(M))
@@ -371,7 +433,7 @@ def _on_subspace(of: Recursion, there: np.ndarray, V: np.ndarray) -> tuple[np.nd
     left, wrong = _shorted(H, shown, A @ root)
     grown = np.tensordot(part.p, left, axes=1)
     moved = 4.0 * len(A) * np.linalg.norm(F) * np.linalg.norm(A * sd / sd[:, None]) * off * sd.max() / sd.min()
-    if not _least(grown - M, M) >= ROUNDING * wrong + moved:
+    if not _least(grown - M, M) >= ROUNDING * of.doubt * wrong + moved:
         return None
     X, share = np.zeros_like(of.F), np.linalg.solve(root, grown)
     X[np.ix_(there, there)] = V @ M @ V.T

@@ -144,8 +144,8 @@ def _require_settling(case: Case | UnlikeCase, unsettled: np.ndarray) -> None:
         proof = growing(recursion, decide(recursion)[1])
         if proof is not None:
             raise NoAnswerError(
-                f"no steady state: a direction of rank {proof.rank} grows by a factor of at least {proof.factor:.6g} in "
-                "every step, on average over what arrives: too often too little that arrives shows it"
+                f"no steady state: a direction of rank {proof.rank} grows by a factor of at least {proof.factor:.6g} "
+                "in every step, on average over what arrives: too often too little that arrives shows it"
             )
 
 

@@ -8,14 +8,16 @@ bounded at one µ is so at every larger one.  `stochfuse.prediction.boundedness`
 down to rounding without proofs; then µ is moved away from it, up and down, until there is one: `high` and `low`.
 
 Every agent has a recursion of its own (`stochfuse.prediction.simplified`), and the mean over agents is bounded where
-all are.  Where all eigenvalues of F lie within the unit circle or on it, µ_c is 0: F X Fᵀ is no larger than X by
-determinant on an invariant subspace, so what grew there would have to be hidden from all that can arrive, at µ = 1 too.  At µ_c itself
-nothing is said: an eigenvalue on the circle grows without end at µ = 0, though slowly.
+all are.  Where no eigenvalue of F lies outside the unit circle, µ_c is 0 or there is none: F X Fᵀ has no larger
+determinant than X on an invariant subspace, so what did not shrink there would be hidden from all that can arrive, at
+µ = 1 too.  At µ_c itself nothing is said: a mode on the circle that nothing shows grows without end at µ = 0, though
+slowly.
 
 What is swept need not be the links: any probability that a scenario depends on will do, of which more is never worse.
 
-Departure.  Sinopoli et al. 2004 bound the critical probability of the *expected* covariance, 1 − 1/max|λ|² ≤ γ_c ≤ γ̄; for (54)
-with one sender and a receiver without a sensor, γ̄ is what is found here.
+Departure.  Sinopoli et al. 2004 enclose the critical probability γ_c of the *expected* covariance,
+1 − 1/max|λ|² ≤ γ_c ≤ γ̄.  (54) is an upper bound of that expectation, by concavity; for one sender and a receiver
+without a sensor its critical µ is their γ̄.
 """
 
 from __future__ import annotations
@@ -33,19 +35,23 @@ from stochfuse.prediction.boundedness import (
     Growing,
     Recursion,
     bounded,
+    conditioned,
     decide,
     growing,
     hidden_mode,
+    rebased,
     recursions,
     stable,
 )
 from stochfuse.prediction.result import Result
-from stochfuse.scenario.network import LinkRows, reachable, restricted, stacked_rows
+from stochfuse.scenario.network import LinkRows, restricted, stacked_rows
 from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario
 from stochfuse.scenario.system import Items
 
-NARROW = 2e-15
-"""Width at which the search ends."""
+ROUNDED = 2e-15
+"""Width at which the search for the crossing ends."""
+NARROW, BETTER = 1e-10, 3
+"""Width of a bracket that is good enough, and how many changes of coordinates are tried for one."""
 FIRST, FACTOR = 1e-14, 4.0
 """How far from the crossing a proof is tried first, and by how much farther each time."""
 
@@ -95,7 +101,9 @@ class Critical(Result):
                 f"{above}; unbounded at {self.name} {self.low:.15g}: a direction X of rank {self.growing.rank} that "
                 f"every step makes larger, by a factor of at least 1 + {self.growing.factor - 1.0:.2g}"
             )
-        return above + (f"; there is no {self.name} below 0" if self.high else "")
+        if self.critical:
+            return f"{above}; that it is unbounded at any {self.name} below was not proved"
+        return above
 
     def curve(self, points: int = 101) -> tuple[np.ndarray, np.ndarray]:
         """Return values from 0 to 1 and the growth of large covariances per step at each."""
@@ -169,13 +177,31 @@ class _Receiver(NamedTuple):
     recursion: Recursion
 
 
+class _Bracket(NamedTuple):
+    """Where receivers become stable, the last of them, and what is proved on both sides; see `Critical`."""
+
+    middle: float
+    worst: tuple[tuple[int, ...], ...]
+    low: float
+    high: float
+    growing: Growing | None
+    bounded: tuple[Bounded, ...] | None
+
+    def narrowed(self, other: _Bracket) -> _Bracket:
+        """Return what two brackets say together: a proof is one in any coordinates."""
+        low, high = max(self, other, key=lambda one: one.low), min(self, other, key=lambda one: one.high)
+        nearest = min(self, other, key=lambda one: one.high - one.low)
+        middle = min(max(nearest.middle, low.low), high.high)
+        return _Bracket(middle, nearest.worst, low.low, high.high, low.growing, high.bounded)
+
+
 class _Links:
     """The receivers of a scenario at any probability of all its links."""
 
     def __init__(self, scenario: Scenario):
         network = scenario.network
         if network.cases:
-            raise UsageError("critical: expected a scenario without network.case, since its links are replaced by one µ")
+            raise UsageError("critical: expected no network.case, since one µ takes the place of all links, got cases")
         if network.burst is not None:
             raise UsageError("critical: expected links without memory, got network.burst")
         link, self._mask = network.link, None
@@ -215,6 +241,7 @@ class _Asked:
     def __init__(self, at: Callable[[float], list[_Receiver]], name: str, receivers: Sequence[tuple[int, ...]]):
         self._at, self._name, self._receivers = at, name, list(receivers)
         self._gains: dict[tuple[int, ...], np.ndarray] = {}
+        self._coordinates: dict[tuple[int, ...], np.ndarray] = {}
 
     def answer(self, scenario: Scenario, agent: int | str) -> Critical:
         """Return the answer, or raise NoAnswerError."""
@@ -223,31 +250,55 @@ class _Asked:
         lost = [who for who, excess in over.items() if excess > 0]
         if lost:
             raise NoAnswerError(self._why(lost[0]))
-        middle, worst = self._crossing(everyone, max(over.values()))
-        high, proofs = self._proved_above(middle, everyone)
-        low, proof = self._proved_below(middle, worst)
+        found = self._bracket(everyone)
+        for _ in range(BETTER):
+            if found.high - found.low < NARROW or not self._conditioned(found.middle, found.worst):
+                break
+            found = found.narrowed(self._bracket(everyone))
+        if found.bounded is None:
+            raise NoAnswerError(f"no {self._name} was found at which the covariance is proved to be bounded")
         return Critical(
             scenario=scenario,
             name=self._name,
             agent=agent,
-            critical=middle,
-            low=low,
-            high=high,
-            agents=tuple(sorted(number for who in worst for number in who)),
-            growing=proof,
-            bounded=proofs,
+            critical=found.middle,
+            low=found.low,
+            high=found.high,
+            agents=tuple(sorted(number for who in found.worst for number in who)),
+            growing=found.growing,
+            bounded=found.bounded,
             radius=lambda x: 1.0 + max(self._excess(x, everyone).values()),
         )
+
+    def _bracket(self, everyone: Sequence[tuple[int, ...]]) -> _Bracket:
+        middle, worst = self._crossing(everyone)
+        high, proofs = self._proved_above(middle, everyone)
+        low, proof = self._proved_below(middle, worst)
+        return _Bracket(middle, tuple(worst), low, high, proof, proofs)
 
     def _recursions(self, x: float, who: Sequence[tuple[int, ...]]) -> list[tuple[Recursion, np.ndarray, float]]:
         """Each receiver's recursion, its best gains and the growth ρ(ĝ)."""
         found, there = [], self._at(x)
         for agents in who:
             recursion = next(r.recursion for r in there if agents[0] in r.agents)
+            if agents in self._coordinates:
+                recursion = rebased(recursion, self._coordinates[agents])
             ρ, gains = decide(recursion, self._gains.get(agents))
             self._gains[agents] = gains
             found.append((recursion, gains, ρ))
         return found
+
+    def _conditioned(self, x: float, who: Sequence[tuple[int, ...]]) -> bool:
+        """Change to coordinates in which large covariances are well conditioned; whether any had to be changed."""
+        changed = False
+        for agents, (recursion, gains, _) in zip(who, self._recursions(x, who), strict=True):
+            better = conditioned(recursion, gains)
+            if better is not None:
+                before = self._coordinates.get(agents, np.eye(len(recursion.F)))
+                self._coordinates[agents] = before @ np.linalg.solve(recursion.T, better.T)
+                del self._gains[agents]
+                changed = True
+        return changed
 
     def _excess(self, x: float, who: Sequence[tuple[int, ...]]) -> dict[tuple[int, ...], float]:
         """ρ(ĝ) − 1 of each receiver, positive where it is not below 0 for certain."""
@@ -257,18 +308,16 @@ class _Asked:
             found[agents] = -excess if stable(recursion, gains) else excess
         return found
 
-    def _crossing(
-        self, everyone: Sequence[tuple[int, ...]], at_one: float
-    ) -> tuple[float, Sequence[tuple[int, ...]]]:
+    def _crossing(self, everyone: Sequence[tuple[int, ...]]) -> tuple[float, Sequence[tuple[int, ...]]]:
         """Where the last receivers become stable, to rounding, and these; by secants between what is stable and not."""
         over = self._excess(0.0, everyone)
         worst = [who for who, excess in over.items() if excess > 0]
         marginal = [np.abs(np.linalg.eigvals(r.recursion.F)).max() <= 1.0 for r in self._at(0.0)]
         if not worst or all(marginal):
             return 0.0, worst or everyone
-        excess = {0.0: max(over.values()), 1.0: at_one}
+        excess = {0.0: max(over.values()), 1.0: max(self._excess(1.0, everyone).values())}
         low, high, widths = 0.0, 1.0, [1.0]
-        while high - low > NARROW:
+        while high - low > ROUNDED:
             f_low, f_high = excess[low], excess[high]
             x = high - f_high * (high - low) / (f_high - f_low)
             # a secant that leaves one end where it was for long is no better than halves
@@ -285,13 +334,13 @@ class _Asked:
             widths.append(high - low)
         return high, worst
 
-    def _proved_above(self, middle: float, who: Sequence[tuple[int, ...]]) -> tuple[float, tuple[Bounded, ...]]:
+    def _proved_above(self, middle: float, who: Sequence[tuple[int, ...]]) -> tuple[float, tuple[Bounded, ...] | None]:
         """The nearest value above the crossing at which a proof is found for every receiver, and the proofs."""
         for x in _away(middle, 1.0):
             proofs = [bounded(recursion, gains) for recursion, gains, _ in self._recursions(x, who)]
             if all(proof is not None for proof in proofs):
                 return x, tuple(proof for proof in proofs if proof is not None)
-        raise NoAnswerError(f"no {self._name} was found at which the covariance is proved to be bounded")
+        return 1.0, None
 
     def _proved_below(self, middle: float, who: Sequence[tuple[int, ...]]) -> tuple[float, Growing | None]:
         """The nearest value below the crossing at which some receiver's recursion is proved to grow, and the proof."""
