@@ -35,7 +35,6 @@ QUESTION = "Options"
 EXAMPLES = (
     "stochfuse solve --target 30 --method general",
     "stochfuse solve --target 25 --agents-needed --link 0.5",
-    "stochfuse solve --critical",
 )
 
 NOT_CRITICAL = ("target", "agents-needed", "sensitivity", "gain", "steady")
@@ -49,22 +48,22 @@ class Asked(NamedTuple):
         float | None, option("Least link probability at which the value is at most X.", QUESTION, metavar="X")
     ] = None
     agents_needed: Annotated[
-        bool, option("With --target and --link: the least number of agents instead.", QUESTION, "--agents-needed")
+        bool, option("With --target, --link: the least number of agents.", QUESTION, "--agents-needed")
     ] = False
     sensitivity: Annotated[
         bool, option("What each link is worth, and which to improve first.", QUESTION, "--sensitivity")
     ] = False
-    gain: Annotated[
-        bool, option("Share of the gain from µ = 0 to µ = 1 that each --link reaches.", QUESTION, "--gain")
-    ] = False
+    gain: Annotated[bool, option("Share of the gain from µ = 0 to 1 that each --link reaches.", QUESTION, "--gain")] = (
+        False
+    )
     steady: Annotated[
         bool,
-        option("Ask about the steady state (simplified); alone: tabulate it against --link.", QUESTION, "--steady"),
+        option("Ask about the steady state; alone: tabulate it over --link.", QUESTION, "--steady"),
     ] = False
 
     critical: Annotated[
         bool,
-        option("Least link probability at which the average stays bounded, with proof.", QUESTION, "--critical"),
+        option("The µ above which the average stays bounded, proved.", QUESTION, "--critical"),
     ] = False
 
     @property
@@ -112,10 +111,9 @@ def solve(
     max_graphs: MaxGraphsOption = None,
     to: Written = Written(),
 ) -> None:
-    """Answer a question asked backwards: which link probability, which link, how many agents.
+    """Answer a question asked backwards: which µ, which link, how many agents.
 
-    One question a call: --target X (with --agents-needed: the agents), --sensitivity, --gain, --critical, or --steady
-    alone.
+    One question a call: --target X (with --agents-needed: the agents), one of the others, or --steady alone.
     """
     from stochfuse.report import solutions
 

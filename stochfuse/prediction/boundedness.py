@@ -25,10 +25,12 @@ inequality of Sinopoli et al. 2004, for any number of sensors; with one sensor o
 
 The gains are found by policy iteration for the least spectral radius ρ(L_K): X = (ρ(1+ε) − L_K)⁻¹I, K ← the best for X.
 
-What is certified.  Bounded: g(P) ⪯ P with the gains written down, by `ROUNDING` in units of P's own deviations.
-Growing: X = V M Vᵀ on an invariant subspace of F, F V = V A; ĝ(X) ⪰ X by as much, as r×r matrices.  What is zero by
-structure (a direction that a sensor does not show, an invariant subspace) is zero to `STRUCTURE` of the
-matrix's size: such a certificate holds for a scenario within rounding of the one given.
+What is certified.  Bounded: g(P) ⪯ P with the gains written down, by more than `ROUNDING` in units of P's own
+deviations.  Growing: X = V M Vᵀ on an invariant subspace of F, F V = V A, and ĝ(X) ⪰ X as r×r matrices, by more than
+`ROUNDING` and than what V may be off: the rounding in F V = V A over the separation of A from the rest of F.  So a
+subspace that rounding alone makes invariant (an eigenvector beside a Jordan block's) proves nothing.  What is zero by
+structure, a direction that a sensor does not show, is zero to `STRUCTURE` of the matrix's size: there a
+certificate holds for a sensor within rounding of the one given.
 """
 
 from __future__ import annotations
