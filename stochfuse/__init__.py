@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from stochfuse.prediction.steady_state import steady_state as steady_state
     from stochfuse.questions.agents_needed import AgentsNeeded as AgentsNeeded
     from stochfuse.questions.agents_needed import agents_needed as agents_needed
+    from stochfuse.questions.critical import Critical as Critical
+    from stochfuse.questions.critical import critical as critical
     from stochfuse.questions.crosscheck import check_results as check_results
     from stochfuse.questions.least_link import LeastLink as LeastLink
     from stochfuse.questions.least_link import least_link as least_link
@@ -54,6 +56,7 @@ if TYPE_CHECKING:
 _HOME = {
     "AgentsNeeded": "questions.agents_needed",
     "Comparison": "prediction.compare",
+    "Critical": "questions.critical",
     "FusionGraph": "estimators.fusion_graph",
     "LeastLink": "questions.least_link",
     "MessageLoad": "questions.messages",
@@ -68,6 +71,7 @@ _HOME = {
     "check_results": "questions.crosscheck",
     "compare": "prediction.compare",
     "compare_estimators": "prediction.compare",
+    "critical": "questions.critical",
     "derive_general": "symbolic.general",
     "derive_optimal": "symbolic.optimal",
     "derive_simplified": "symbolic.simplified",
@@ -89,6 +93,7 @@ _HOME = {
 __all__ = [
     "AgentsNeeded",
     "Comparison",
+    "Critical",
     "FusionGraph",
     "LeastLink",
     "MessageLoad",
@@ -104,6 +109,7 @@ __all__ = [
     "check_results",
     "compare",
     "compare_estimators",
+    "critical",
     "derive_general",
     "derive_optimal",
     "derive_simplified",

@@ -24,6 +24,8 @@ CHAPTERS = {
     "What is true: footprints of the noises": "estimators.world",
     "Claimed, actual and what follows": "prediction.quantities",
     "The steady state": "prediction.steady_state",
+    "Bounded or growing": "prediction.boundedness",
+    "The critical link probability": "questions.critical",
     "Message load": "questions.messages",
     "Covariance intersection": "fusion.intersection",
     "Parallel filters and blenders": "fusion.parallel",

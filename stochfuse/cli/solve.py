@@ -28,6 +28,7 @@ from stochfuse.scenario.registry import METHODS, SIMPLIFIED
 
 if TYPE_CHECKING:
     from stochfuse.report.solutions import SolutionSheet
+    from stochfuse.report.table import Report
     from stochfuse.scenario.scenario import Scenario
 
 QUESTION = "Options"
@@ -35,6 +36,9 @@ EXAMPLES = (
     "stochfuse solve --target 30 --method general",
     "stochfuse solve --target 25 --agents-needed --link 0.5",
 )
+
+NOT_CRITICAL = ("target", "agents-needed", "sensitivity", "gain", "steady")
+"""Questions about a number, which has a step and a metric; whether it is bounded is the same in all of them."""
 
 
 class Asked(NamedTuple):
@@ -44,17 +48,22 @@ class Asked(NamedTuple):
         float | None, option("Least link probability at which the value is at most X.", QUESTION, metavar="X")
     ] = None
     agents_needed: Annotated[
-        bool, option("With --target and --link: the least number of agents instead.", QUESTION, "--agents-needed")
+        bool, option("With --target, --link: the least number of agents.", QUESTION, "--agents-needed")
     ] = False
     sensitivity: Annotated[
         bool, option("What each link is worth, and which to improve first.", QUESTION, "--sensitivity")
     ] = False
-    gain: Annotated[
-        bool, option("Share of the gain from µ = 0 to µ = 1 that each --link reaches.", QUESTION, "--gain")
-    ] = False
+    gain: Annotated[bool, option("Share of the gain from µ = 0 to 1 that each --link reaches.", QUESTION, "--gain")] = (
+        False
+    )
     steady: Annotated[
         bool,
-        option("Ask about the steady state (simplified); alone: tabulate it against --link.", QUESTION, "--steady"),
+        option("Ask about the steady state; alone: tabulate it over --link.", QUESTION, "--steady"),
+    ] = False
+
+    critical: Annotated[
+        bool,
+        option("The µ above which the average stays bounded, proved.", QUESTION, "--critical"),
     ] = False
 
     @property
@@ -72,6 +81,7 @@ class Asked(NamedTuple):
             sensitivity=self.sensitivity,
             gain=self.gain,
             steady=self.steady,
+            critical=self.critical,
         )
 
 
@@ -101,9 +111,9 @@ def solve(
     max_graphs: MaxGraphsOption = None,
     to: Written = Written(),
 ) -> None:
-    """Answer a question asked backwards: which link probability, which link, how many agents.
+    """Answer a question asked backwards: which µ, which link, how many agents.
 
-    One question a call: --target X (with --agents-needed: the agents), --sensitivity, --gain, or --steady alone.
+    One question a call: --target X (with --agents-needed: the agents), one of the others, or --steady alone.
     """
     from stochfuse.report import solutions
 
@@ -113,10 +123,19 @@ def solve(
         ("--link", changes.link, ("agents-needed", "sensitivity", "gain", "steady")),
         ("--case", case, ("sensitivity",)),
         ("--max-agents", max_agents, ("agents-needed",)),
-        ("--agents", changes.agents, ("target", "sensitivity", "gain", "steady")),
+        ("--agents", changes.agents, ("target", "sensitivity", "gain", "steady", "critical")),
+        ("--step", step, NOT_CRITICAL),
+        ("--metric", metric, NOT_CRITICAL),
+        ("--estimator", estimator, NOT_CRITICAL),
+        ("--max-graphs", max_graphs, NOT_CRITICAL),
+        ("--method", None if method == SIMPLIFIED else method, NOT_CRITICAL),
+        ("--quantity", None if quantity == "claimed" else quantity, NOT_CRITICAL),
     ):
         if value is not None and kind not in wanted:
             raise UsageError(f"{flag}: expected with --{', --'.join(wanted)}; got it with --{kind}")
+    if kind == "critical":
+        to.write(_critical(changes.of(scenario)[0], agent))
+        return
     asked: dict[str, Any] = {
         "step": step,
         "steady": asked_for.steady,
@@ -133,8 +152,17 @@ def solve(
     to.write(solutions.solution_report(sheet, found))
 
 
-def _question(target: float | None, *, agents_needed: bool, sensitivity: bool, gain: bool, steady: bool) -> str:
-    questions = {"target": target is not None, "sensitivity": sensitivity, "gain": gain}
+def _critical(given: Scenario, agent: str | None) -> Report:
+    from stochfuse.questions.critical import critical
+    from stochfuse.report.critical import critical_report
+
+    return critical_report(critical(given, agent=whose(agent, given)))
+
+
+def _question(
+    target: float | None, *, agents_needed: bool, sensitivity: bool, gain: bool, steady: bool, critical: bool
+) -> str:
+    questions = {"target": target is not None, "sensitivity": sensitivity, "gain": gain, "critical": critical}
     chosen = [name for name, wanted in questions.items() if wanted]
     if len(chosen) > 1:
         raise UsageError(f"expected one question a call, got --{' and --'.join(chosen)}")
@@ -145,7 +173,7 @@ def _question(target: float | None, *, agents_needed: bool, sensitivity: bool, g
     if not chosen and not steady:
         raise UsageError(
             "expected a question: --target X (the least link probability; with --agents-needed the least number of "
-            "agents), --sensitivity, --gain, or --steady; got none"
+            "agents), --sensitivity, --gain, --critical, or --steady; got none"
         )
     return chosen[0] if chosen else "steady"
 

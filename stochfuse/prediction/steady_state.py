@@ -10,15 +10,13 @@ the positive-definite order; P₋ = (1−ε)P and P₊ = (1+ε)P are tried for �
 is reported as the relative bound.  A bracket counts only if it holds by more than rounding can do: by `ROUNDING`, in
 units of the states' standard deviations, with g evaluated in square-root form, whose error there is below 1e-14.
 
-That there is none can be proved at no cost.  For an eigenvector w of F, F w = λ w, let
-φ(P) = 1/(wᴴ P⁻¹ w): it is monotone and concave, the prediction multiplies it by |λ|² at least, and an update with
-H w = 0 leaves it as it is.  So φ(g_µ(P)) ≥ p |λ|² φ(P) + p φ(Q), p the probability that nothing that arrives sees w; it
-grows without end where p |λ|² > 1, and where p |λ|² = 1 and Q is positive definite.
+That there is none is proved by a direction that grows (`stochfuse.prediction.boundedness`): at no cost by a mode of F,
+before anything is tried, and in full for what does not settle soon.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -28,8 +26,8 @@ from stochfuse.engines.mean_field import CANCELLATION, Case, Form, MeasurementSp
 from stochfuse.engines.progress import listener
 from stochfuse.errors import NoAnswerError, UsageError
 from stochfuse.kalman.averaged_update import basis, triangle
-from stochfuse.kalman.kernel import at_step
 from stochfuse.prediction import simplified
+from stochfuse.prediction.boundedness import decide, growing, growing_mode, hidden_mode, recursions
 from stochfuse.prediction.result import brief
 from stochfuse.scenario.model import Model, Sensor
 from stochfuse.scenario.network import LinkRows
@@ -42,6 +40,10 @@ ROUNDING = 1e-13
 STALLED = 1e-8
 NEWTON = 30
 PLAIN = 20_000
+DOUBTFUL = 5 * WARM_UP
+"""Steps after which a proof is tried that what has not settled never will."""
+MOST_PROOFS = 8
+"""Items for which it is tried."""
 
 
 class SteadyState(NamedTuple):
@@ -115,42 +117,36 @@ def steady_state(scenario: Scenario, link: Sequence[float] | LinkRows | None = N
 
 
 def _require_detectable(model: Model, sensor: Sensor, P0: np.ndarray) -> None:
-    """Hautus test, in units of the states' deviations: every eigenvalue on or outside the unit circle is observed."""
     sd = np.sqrt(np.diagonal(P0 + model.Q))
     sd = np.where(sd > 0, sd, 1.0)
-    F, H = model.F * sd / sd[:, None], sensor.H * sd
-    H = H / np.maximum(np.linalg.norm(H, axis=1, keepdims=True), 1e-300)
-    for eigenvalue in np.linalg.eigvals(F):
-        if abs(eigenvalue) >= 1.0 - 1e-9:
-            hautus = np.concatenate([eigenvalue * np.eye(len(F)) - F, H])
-            if np.linalg.svd(hautus, compute_uv=False)[-1] < 1e-10 * max(1.0, abs(eigenvalue)):
-                raise NoAnswerError(
-                    f"no steady state: the stand-alone filter does not converge, since the mode of F with eigenvalue "
-                    f"{eigenvalue:.6g} is not observed by H"
-                )
+    eigenvalue = hidden_mode(model.F * sd / sd[:, None], sensor.H * sd)
+    if eigenvalue is not None:
+        raise NoAnswerError(
+            f"no steady state: the stand-alone filter does not converge, since the mode of F with eigenvalue "
+            f"{eigenvalue:.6g} is not observed by H"
+        )
 
 
 def _require_bounded(case: UnlikeCase) -> None:
-    """Raise NoAnswerError where a direction must grow, see the module's text."""
-    F, Q, weights = at_step(case.model.F, 2), at_step(case.model.Q, 2), case.weights[1]
-    for eigenvalue, w in _modes(F):
-        seen = np.array([np.linalg.norm(s.at(2).H @ w) > 1e-10 * np.linalg.norm(s.at(2).H) for s in case.sensors])
-        unseen = (case.counts[:, seen] == 0).all(axis=1)
-        growth = float(weights[unseen].sum(axis=0).max()) * abs(eigenvalue) ** 2
-        certain = 1.0 - 1e-12 if np.linalg.eigvalsh(Q)[0] > 0 else 1.0 + 1e-12
-        if growth >= certain:
+    """Raise NoAnswerError where a mode must grow: at a glance, for all items."""
+    found = growing_mode(case)
+    if found is not None:
+        eigenvalue, growth = found
+        raise NoAnswerError(
+            f"no steady state: the mode of F with eigenvalue {eigenvalue:.6g} grows by a factor of at least "
+            f"{growth:.6g} in every step, on average over what arrives: too often nothing that arrives shows it"
+        )
+
+
+def _require_settling(case: Case | UnlikeCase, unsettled: np.ndarray) -> None:
+    """Raise NoAnswerError where some direction must grow: for a few of the items that have not settled yet."""
+    for recursion in recursions(case.take(unsettled[:MOST_PROOFS])):
+        proof = growing(recursion, decide(recursion)[1])
+        if proof is not None:
             raise NoAnswerError(
-                f"no steady state: the mode of F with eigenvalue {eigenvalue:.6g} grows by a factor of at least "
-                f"{growth:.6g} in every step, on average over what arrives: too often nothing that arrives shows it"
+                f"no steady state: a direction of rank {proof.rank} grows by a factor of at least {proof.factor:.6g} "
+                "in every step, on average over what arrives: too often too little that arrives shows it"
             )
-
-
-def _modes(F: np.ndarray) -> Iterator[tuple[complex, np.ndarray]]:
-    """Eigenvalues of F on or outside the unit circle, and vectors of their eigenspaces."""
-    eigenvalues, vectors = np.linalg.eig(F)
-    for eigenvalue, w in zip(eigenvalues, vectors.T, strict=True):
-        if abs(eigenvalue) >= 1.0:
-            yield (eigenvalue.real if eigenvalue.imag == 0 else eigenvalue), w
 
 
 def _apply(case: Case | UnlikeCase, P: np.ndarray) -> np.ndarray:
@@ -194,6 +190,8 @@ def _solve(case: Case | UnlikeCase) -> np.ndarray:
         P, residual = _newton(case, P)
         P = _vanishing(case, P)
         worst = float(residual.max())
+        if steps == DOUBTFUL:
+            _require_settling(case, np.flatnonzero(residual > TOLERANCE))
         if worst <= TOLERANCE or (worst <= STALLED and worst >= 0.5 * before):
             return P
         before = worst

@@ -19,6 +19,11 @@ TERMS = {
         "µ: the probability that one message from one agent reaches another within a step. Without "
         "bursts, messages are lost independently of each other and of the data."
     ),
+    "critical link probability": (
+        "The µ above which the averaged covariance stays bounded where a mode of the model grows by itself: 1 - "
+        "1/|eigenvalue|^2 where one message shows the state, more where it shows a part (Sinopoli et al. 2004). See "
+        "stochfuse solve --critical."
+    ),
     "exact": (
         "An average over every outcome of which messages arrive, each with its probability; only rounding "
         "is left, and its reach is checked."

@@ -11,10 +11,12 @@ from stochfuse.kalman.metrics import metric
 from stochfuse.prediction.compare import Comparison, EstimatorComparison
 from stochfuse.prediction.result import Prediction
 from stochfuse.questions.agents_needed import AgentsNeeded
+from stochfuse.questions.critical import Critical
 from stochfuse.questions.least_link import LeastLink
 from stochfuse.questions.messages import MessageLoad
 from stochfuse.questions.sensitivity import Sensitivity, ShareOfGain
 from stochfuse.report import comparisons, messages, predictions, solutions, study_figures
+from stochfuse.report.critical import critical_report
 from stochfuse.report.plot import figure_class
 from stochfuse.report.predictions import PredictionView
 from stochfuse.report.table import Report, to_html, to_text
@@ -39,6 +41,8 @@ def report_of(result: Any, of: str | None = None, agent: int | str = "mean") -> 
     sheet = SHEETS.get(type(result))
     if sheet is not None:
         return solutions.solution_report(sheet(result), result)
+    if isinstance(result, Critical):
+        return critical_report(result)
     if isinstance(result, MessageLoad):
         return messages.load_report(messages.LoadView((result,), result))
     if isinstance(result, Results):
