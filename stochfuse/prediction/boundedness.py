@@ -125,8 +125,10 @@ def recursions(case: Case | UnlikeCase) -> list[Recursion]:
     F, Q = at_step(case.model.F, 2), at_step(case.model.Q, 2)
     unit = np.sqrt(np.diagonal(case.P0 + Q))
     unit = np.where(unit > 0, unit, 1.0)
-    if isinstance(case, Case):  # its own measurement always comes, and what else may come shows no more
-        sensors, counts, weights = (case.sensor,), np.ones((1, 1), dtype=int), np.ones((1, case.items))
+    if isinstance(case, Case):  # what else may come shows no more than the first measurement does
+        sensors, counts = (case.sensor,), np.array([[1], [0]])
+        nothing = np.broadcast_to(getattr(case.arrivals[1], "nothing", 0.0), case.items)
+        weights = np.stack([1.0 - nothing, nothing])
     else:
         sensors, counts, weights = case.sensors, case.counts, case.weights[1]
     H, R, of = _shown(sensors, counts.shape, (counts > 0).tobytes(), unit.tobytes())

@@ -54,8 +54,8 @@ class Sensor:
 
     @property
     def varies(self) -> bool:
-        """Whether H or R depends on the step."""
-        return varies(self.H) or varies(self.R)
+        """Whether H, R or the detection depends on the step."""
+        return varies(self.H) or varies(self.R) or (self.detection is not None and self.detection.ndim > 0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -188,8 +188,9 @@ class System:
             return None
         columns = []
         for sensor in self.sensors:
-            p = np.broadcast_to(1.0 if sensor.detection is None else sensor.detection, self.steps)
-            columns.append(np.where(sensor.H.any(axis=(-2, -1)), p, 1.0))
+            p = np.array(1.0) if sensor.detection is None else sensor.detection
+            now = p[: self.steps] if p.ndim else np.broadcast_to(p, self.steps)
+            columns.append(np.where(sensor.H.any(axis=(-2, -1)), now, 1.0))
         found = np.stack(columns, axis=1)
         found[0] = 1.0
         return None if (found == 1.0).all() else found

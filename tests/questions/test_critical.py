@@ -358,3 +358,36 @@ def test_figure_and_results(file):
     assert found.plot() is not None
     assert "critical=0.471" in repr(found)
     assert found.to_dataframe().critical[0] == found.critical
+
+
+def sinopoli(a, p, **more):
+    source = {
+        "model": {"F": a, "H": 1.0, "Q": 1.0, "R": 2.5, "sensor": {"detection": p}},
+        "initial": {"P": 1.0},
+        "network": {"agents": 1, "steps": 40},
+    }
+    return sf.load_scenario({**source, **more})
+
+
+@pytest.mark.parametrize("a", [1.01, 1.25, 2.0, 7.0])
+def test_the_critical_detection_of_one_sensor(a):
+    """Sinopoli's recursion itself: 1 − 1/a², of a sensor that may miss instead of a link that may lose."""
+    found = sf.critical(sinopoli(a, 1.0), lambda p: sinopoli(a, p), name="model.sensor.detection")
+    assert found.critical == pytest.approx(1 - 1 / a**2, abs=1e-9)
+    assert found.low <= 1 - 1 / a**2 <= found.high
+    assert "model.sensor.detection" in found.certificate
+
+
+@pytest.mark.parametrize("p", [0.0, 0.3, 0.5, 0.9])
+def test_one_sensor_that_may_miss_follows_sinopoli(p):
+    a, P, out = 1.25, 1.0, [1.0]
+    for _ in range(39):
+        prior = a * P * a + 1.0
+        P = prior - p * prior**2 / (prior + 2.5)
+        out.append(P)
+    np.testing.assert_allclose(sf.predict(sinopoli(a, p), [0.5]).values()[0], out, rtol=1e-12)
+    if p > 0.37:
+        np.testing.assert_allclose(sf.steady_state(sinopoli(a, p), [0.5]).P.item(), out[-1], rtol=1e-2)
+    else:
+        with pytest.raises(sf.NoAnswerError):
+            sf.steady_state(sinopoli(a, p), [0.5])
