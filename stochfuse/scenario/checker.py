@@ -22,8 +22,9 @@ class Checker:
         self._skip = skip
 
     def note(self, path: str, expected: str, got: str) -> None:
-        """Remember one problem."""
-        self.problems.append(Problem(path, expected, got))
+        """Remember one problem, the first that is found of a path: several readers may look at one."""
+        if all(problem.path != path for problem in self.problems):
+            self.problems.append(Problem(path, expected, got))
 
     def missing(self, path: str, expected: str) -> None:
         """Remember that something is not there, unless that is known already."""

@@ -364,7 +364,7 @@ def sinopoli(a, p, **more):
     source = {
         "model": {"F": a, "H": 1.0, "Q": 1.0, "R": 2.5, "sensor": {"detection": p}},
         "initial": {"P": 1.0},
-        "network": {"agents": 1, "steps": 40},
+        "network": {"agents": 1, "steps": 40, "link": 0.5},
     }
     return sf.load_scenario({**source, **more})
 
