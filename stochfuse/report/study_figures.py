@@ -16,7 +16,7 @@ import numpy as np
 
 from stochfuse.errors import UsageError
 from stochfuse.report import studies
-from stochfuse.report.plot import COLORS, MARKERS, figure_class, spread
+from stochfuse.report.plot import COLORS, DASHES, MARKERS, figure_class, spread
 from stochfuse.report.predictions import counted
 from stochfuse.report.studies import LONGEST, load_label, shortened, spoken, whose, words_of
 from stochfuse.report.study_slices import (
@@ -41,9 +41,35 @@ if TYPE_CHECKING:
 
 KINDS = ("heat", "contour")
 SIZE = (7.5, 5.6)
-STYLES = ("-", "--", ":", "-.")
 MANY = 1000
 """Scattered points from which on they are drawn small, and as pixels even in vector files."""
+
+
+COLOURS = "cividis"
+RATIO = 30.0
+"""Ratio of the greatest to the least number above which they are drawn on a log scale."""
+SMALL = 9
+"""Points of the smaller print."""
+BELOW: dict[str, Any] = {"fontsize": SMALL, "loc": "upper center", "bbox_to_anchor": (0.5, -0.14), "frameon": False}
+"""A legend below the axes, where it hides nothing."""
+MOST_TICKS = 14
+NAMES = {
+    "network.link": "link probability µ",
+    "network.agents": "number of agents",
+    "network.steps": "number of steps",
+    "network.architecture": "architecture",
+    "model.R": "measurement noise R",
+    "model.Q": "process noise Q",
+    "initial.P": "initial covariance P(k0)",
+}
+MOST_ACROSS, MOST_DOWN = 11, 16
+"""Cells up to which each has its number written in it."""
+MARGIN, APART = 0.03, 0.06
+"""Shares of the axes: of the rim without labels, and of the distance between labels."""
+MANY_POINTS = 500
+"""Points of a front's figure from which on they are drawn small, and as pixels even in vector files."""
+NUMBERS_APART, DIGIT = 0.02, 0.013
+"""Shares of the axes: between the numbers of points, and of the width of a digit."""
 
 
 def summary_report(results: Results, digits: int, drawn: tuple[Any, ...] = ()) -> Report:
@@ -165,7 +191,7 @@ def _lines(axes: Any, shown: Slice) -> None:
         y[at[there]] = shown.values[there]
         gone[i] = np.isnan(y)
         style: dict[str, Any] = {"color": COLORS[i], "marker": MARKERS[i] if len(x) <= 40 else None, "markersize": 5}
-        style["linestyle"] = "none" if is_text(axis) else STYLES[i % len(STYLES)]
+        style["linestyle"] = "none" if is_text(axis) else DASHES[i % len(DASHES)]
         axes.plot(x, y, label=shortened(listed[c], words_of(listed)) if other else None, **style)
     if gone.any():
         some = x[gone.any(axis=0)]
@@ -210,25 +236,6 @@ def _entitle(axes: Any, title: str, plan: Plan, lines: Sequence[str]) -> None:
     axes.set_title("\n".join(wrapped(line, 95) for line in whole), fontsize=SMALL)
 
 
-COLOURS = "cividis"
-RATIO = 30.0
-"""Ratio of the greatest to the least number above which they are drawn on a log scale."""
-SMALL = 9
-"""Points of the smaller print."""
-BELOW: dict[str, Any] = {"fontsize": SMALL, "loc": "upper center", "bbox_to_anchor": (0.5, -0.14), "frameon": False}
-"""A legend below the axes, where it hides nothing."""
-MOST_TICKS = 14
-NAMES = {
-    "network.link": "link probability µ",
-    "network.agents": "number of agents",
-    "network.steps": "number of steps",
-    "network.architecture": "architecture",
-    "model.R": "measurement noise R",
-    "model.Q": "process noise Q",
-    "initial.P": "initial covariance P(k0)",
-}
-
-
 def wrapped(text: str, width: int) -> str:
     """Return text in lines of a width."""
     return "\n".join(wrap(text, width, break_on_hyphens=False))
@@ -250,13 +257,13 @@ def norm_of(values: np.ndarray) -> Any:
     return Normalize(low, high) if high > low else Normalize(low - around, low + around)
 
 
-def levels_of(values: np.ndarray, number: int = 9) -> np.ndarray:
+def levels_of(values: np.ndarray) -> np.ndarray:
     """Return round levels from below the least value to above the greatest: 1, 2, 5, 10, … on a log scale."""
     from matplotlib.ticker import MaxNLocator
 
     low, high = float(np.min(values)), float(np.max(values))
     if not wide(values):
-        return np.asarray(MaxNLocator(number).tick_values(low, high))
+        return np.asarray(MaxNLocator(9).tick_values(low, high))
     # one decade more at both ends, since logarithms are rounded
     decades = np.arange(np.floor(np.log10(low)) - 1, np.ceil(np.log10(high)) + 2)
     digits = (1.0, 2.0, 5.0) if high <= 1e4 * low else (1.0,)
@@ -321,12 +328,6 @@ def groups_of(data: Mapping[str, np.ndarray], marked: str | None) -> list[tuple[
         return [("", np.ones(len(data["point"]), dtype=bool))]
     values = data[marked].astype(str)
     return [(name, values == name) for name in dict.fromkeys(values.tolist())]
-
-
-MOST_ACROSS, MOST_DOWN = 11, 16
-"""Cells up to which each has its number written in it."""
-MARGIN, APART = 0.03, 0.06
-"""Shares of the axes: of the rim without labels, and of the distance between labels."""
 
 
 def edges(values: Sequence[float] | np.ndarray, log: bool = False) -> np.ndarray:
@@ -401,9 +402,7 @@ def draw_contour(axes: Any, shown: Slice) -> None:
     inside = values.compressed()
     if min(values.shape) < 2 or inside.min() == inside.max():
         raise UsageError("kind: expected heat where values do not differ along both keys, got contour")
-    levels = levels_of(inside)
-    filled = axes.contourf(x, y, values, levels=levels, cmap=COLOURS, norm=norm_of(inside))
-    label(axes, axes.contour(x, y, values, levels=levels, colors="black", linewidths=0.8))
+    filled = _contours(axes, axes.contourf, axes.contour, (x, y, values), inside)
     colour_bar(axes, filled, inside, spoken(shown.plan, shown.column))
     missing = np.ma.getmaskarray(values)
     if missing.any():
@@ -412,7 +411,15 @@ def draw_contour(axes: Any, shown: Slice) -> None:
         axes.legend(**BELOW)
 
 
-def label(axes: Any, lines: Any) -> None:
+def _contours(axes: Any, fill: Any, draw_lines: Any, field: tuple[Any, ...], values: np.ndarray) -> Any:
+    """Draw round levels of a field, filled and as lines with their values on them; return what is filled."""
+    levels = levels_of(values)
+    filled = fill(*field, levels=levels, cmap=COLOURS, norm=norm_of(values))
+    _label(axes, draw_lines(*field, levels=levels, colors="black", linewidths=0.8))
+    return filled
+
+
+def _label(axes: Any, lines: Any) -> None:
     """Write its value on every line that has room for it, away from the rim and from other labels."""
     from matplotlib.patheffects import withStroke
 
@@ -443,15 +450,8 @@ def draw_triangles(axes: Any, shown: Slice, x: np.ndarray, y: np.ndarray) -> Non
         triangles = Triangulation(unit(shown.over[0], x), unit(shown.over[1], y)).triangles
     except (RuntimeError, ValueError):  # fewer than three points, or all on one line
         return
-    levels, found = levels_of(shown.values), Triangulation(x, y, triangles)
-    axes.tricontourf(found, shown.values, levels=levels, cmap=COLOURS, norm=norm_of(shown.values))
-    label(axes, axes.tricontour(found, shown.values, levels=levels, colors="black", linewidths=0.8))
-
-
-MANY_POINTS = 500
-"""Points of a front's figure from which on they are drawn small, and as pixels even in vector files."""
-NUMBERS_APART, DIGIT = 0.02, 0.013
-"""Shares of the axes: between the numbers of points, and of the width of a digit."""
+    found = Triangulation(x, y, triangles)
+    _contours(axes, axes.tricontourf, axes.tricontour, (found, shown.values), shown.values)
 
 
 def draw_pareto(found: ParetoFront, results: Results) -> Any:
