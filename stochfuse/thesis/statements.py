@@ -100,11 +100,11 @@ def judged(holds: bool | np.bool_, ours: str, otherwise: str = "differs") -> Ver
     return ("agrees" if holds else otherwise), ours
 
 
-def explained(seen: bool | np.bool_, cause: bool | np.bool_, ours: str, otherwise: str = "differs") -> Verdict:
+def explained(seen: bool | np.bool_, cause: bool | np.bool_, ours: str) -> Verdict:
     """Return "explained" if what the thesis saw is seen and its cause is shown; else what is left."""
-    return ("explained" if seen and cause else "agrees" if seen else otherwise), ours
+    return ("explained" if seen and cause else "agrees" if seen else "differs"), ours
 
 
-def listed(values: Sequence[float] | np.ndarray, digits: int = 4, unit: str = "") -> str:
+def listed(values: Sequence[float] | np.ndarray, digits: int = 4) -> str:
     """Return numbers in words: 1, 2, 3."""
-    return ", ".join(f"{value + 0.0:.{digits}g}" for value in values) + unit
+    return ", ".join(f"{value + 0.0:.{digits}g}" for value in values)
