@@ -6,7 +6,8 @@
     >>> p.covariance.shape                     # link, step, state, state
     (3, 5, 1, 1)
 
-`sf.kalman` and `sf.fusion` are doors to the filter's equations and to the rules of fusion for arrays of one's own.
+`sf.kalman` and `sf.fusion` are doors to the filter's equations and to the rules of fusion for arrays of one's own,
+`sf.thesis` to what the thesis found.
 Names are loaded when first used, so that the command line starts without what it does not need.
 """
 
@@ -130,7 +131,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name in ("fusion", "kalman"):
+    if name in ("fusion", "kalman", "thesis"):
         return import_module(f"stochfuse.{name}")
     if name not in _HOME:
         raise AttributeError(f"module 'stochfuse' has no attribute '{name}'")

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+import stochfuse
 from stochfuse.errors import ScenarioError, UsageError
 from stochfuse.estimators.ledger import Ledger, check_definite, evaluate
 from stochfuse.estimators.local_fusion_graph import LocalFusionGraph, Pedigrees
@@ -123,8 +124,8 @@ def history_names() -> list[str]:
     return sorted(path.stem for path in _HISTORIES.glob("*.toml"))
 
 
-def load_history(source: str | Path = "thesis-example") -> History:
-    """Read a history: a name that comes with the package, a TOML or JSON file, or "-" for standard input.
+def load_history(source: str | Path | Mapping[str, Any] = "thesis-example") -> History:
+    """Read a history: a name that comes with the package, a TOML or JSON file, "-" for standard input, or a mapping.
 
     Raises
     ------
@@ -138,6 +139,8 @@ def load_history(source: str | Path = "thesis-example") -> History:
     >>> len(graph.explain(agent=1, step=3).terms)
     3
     """
+    if isinstance(source, Mapping):
+        return History.from_mapping(source)
     if source in history_names():
         text = (_HISTORIES / f"{source}.toml").read_text(encoding="utf-8")
         return History.from_mapping(parse(str(source), text), str(source))
@@ -248,6 +251,14 @@ class FusionGraph:
         at_hand = self.received(agent, step)
         fused = self._latest(self._union(at_hand))
         return Explanation(agent, step, fused, tuple(n for n in at_hand if n not in fused), self._terms(fused, step))
+
+    def text(self, agent: int, step: int) -> str:
+        """Return in words how an agent's fused estimate comes about, as `stochfuse graph` prints it."""
+        return stochfuse.shown("graph_text", self, agent, step)
+
+    def plot(self, agent: int, step: int) -> Any:
+        """Return a figure of the graph of an agent's fused estimate, as `stochfuse graph --plot` draws it."""
+        return stochfuse.shown("graph_figure", self, agent, step)
 
     def estimates(self, scenario: Scenario, measurements: Any = None) -> dict[Node, Estimate]:
         """Every agent's fused estimate at every step, with a scenario's model, sensors and first estimates.

@@ -18,6 +18,7 @@ from importlib import import_module
 from typing import Any
 
 _HOME = {
+    "Criterion": "intersection",
     "Signal": "intersection",
     "covariance_intersection": "intersection",
     "split_covariance_intersection": "intersection",

@@ -138,23 +138,6 @@ def actual_error(weights: np.ndarray, R: np.ndarray, disturbance: np.ndarray | N
     return NUMPY.symmetric(weights @ total @ NUMPY.transpose(weights))
 
 
-def worst_error(weights: np.ndarray, R: np.ndarray, Delta: np.ndarray) -> np.ndarray:
-    """Error covariance of z̄, (..., p, p), for the correlation of δ with v that makes its trace largest, E[δδᵀ] = Δ.
-
-    With A R Aᵀ = L Lᵀ, A Δ Aᵀ = M Mᵀ and LᵀM = U Σ Vᵀ it is that of L w + M V Uᵀ w with white w, of trace
-    tr A R Aᵀ + tr A Δ Aᵀ + 2 tr Σ: never above the claimed tr R̄, and equal to it where p = 1.
-
-    Parameters
-    ----------
-    weights : (..., p, n·p) A.
-    R, Delta : (..., n·p, n·p) covariance of v and bound on that of δ.
-    """
-    L, M = (weights @ _square_root(covariance) for covariance in (R, Delta))
-    U, _, Vt = np.linalg.svd(NUMPY.transpose(L) @ M)
-    together = L + M @ NUMPY.transpose(Vt) @ NUMPY.transpose(U)
-    return NUMPY.symmetric(together @ NUMPY.transpose(together))
-
-
 def _checked(R: np.ndarray, Delta: np.ndarray | None, sensors: int) -> tuple[np.ndarray, np.ndarray]:
     """R and Δ as checked matrices."""
     R = semidefinite("R", R)

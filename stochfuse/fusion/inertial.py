@@ -103,19 +103,6 @@ class ImuGrade:
         )
 
 
-TACTICAL = ImuGrade.from_data_sheet(
-    angle_random_walk=0.125,
-    velocity_random_walk=0.0198,
-    gyro=(1.0, 0.1, 3600.0),
-    accelerometer=(1.0, 0.1, 3600.0),
-)
-"""A ring-laser tactical-grade unit, Honeywell HG1700.
-
-0.125 °/√h, 0.065 ft/s/√h = 0.0198 m/s/√h, 1 °/h and 1 mg (1 σ) are the maker's figures (brochure N61-1619-000-001, as
-quoted in IS4S NavToolkit, `hg1700_model`; feet, not metres, per second).  The brochure gives no in-run figures: a tenth
-of the turn-on bias is the usual share (Groves section 4.4.1), and τ = 1 h is NavToolkit's assumption."""
-
-
 @dataclass(frozen=True, eq=False)
 class InitialErrors:
     """Standard deviations at the start, each (3,) along north, east, down: attitude (rad), velocity, position."""

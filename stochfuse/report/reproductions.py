@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from textwrap import wrap
 from typing import Any
@@ -135,28 +135,44 @@ def data_tables(sheet: Sheet, digits: int = 5) -> list[Table]:
     return tables
 
 
-def sheet_tables(sheet: Sheet, digits: int = 5) -> list[Table]:
-    """Return all tables of an item, the statements last."""
-    tables = data_tables(sheet, digits)
-    return [*tables, findings_table(sheet.findings, everywhere=False)] if sheet.findings else tables
-
-
 def sheet_report(sheet: Sheet, digits: int = 5) -> Report:
-    """Return an item in every form; its figure only where it has panels."""
+    """Return an item in every form, the statements after its data; a figure only where it has panels."""
+
+    def tables() -> list[Table]:
+        stated = [findings_table(sheet.findings, everywhere=False)] if sheet.findings else []
+        return [*data_tables(sheet, digits), *stated]
+
     figure = partial(draw, sheet) if sheet.panels else None
-    return Report(partial(sheet_tables, sheet, digits), partial(sheet_csv, [sheet]), partial(sheet_json, sheet), figure)
+    return Report(tables, partial(_sheet_csv, sheet), partial(_sheet_json, sheet), figure)
 
 
 def findings_report(findings: Sequence[Finding], title: Sequence[str] = ()) -> Report:
     """Return statements of the thesis beside our numbers in every form."""
-    table = partial(findings_table, findings, title)
-    return Report(table, partial(findings_csv, findings), partial(findings_json, findings))
+    rows = [(" ".join(f.items), f.thesis, f.ours, f.criterion, f.verdict) for f in findings]
+    csv = partial(to_csv, ("items", "thesis", "ours", "criterion", "verdict"), rows)
+    record = {**_head("statements"), "verdicts": MEANING, "statements": list(map(asdict, findings))}
+    return Report(partial(findings_table, findings, title), csv, lambda: record)
 
 
 def listing_report(entries: Sequence[tuple[str, str]]) -> Report:
     """Return what can be reproduced in every form."""
-    csv = partial(to_csv, ("key", "title"), entries)
-    return Report(partial(listing_table, entries), csv, partial(listing_json, entries))
+    title = ("What of the thesis can be reproduced: `stochfuse reproduce KEY`",)
+    table = Table(title, ("key", "what it shows"), (), tuple(entries))
+    record = {**_head("list"), "items": [{"key": key, "title": what} for key, what in entries]}
+    return Report(lambda: table, partial(to_csv, ("key", "title"), entries), lambda: record)
+
+
+def timing_report(rows: Sequence[tuple[str, float | None, float]]) -> Report:
+    """Return seconds for the same work in the thesis and here, (work, there or None, here), in every form."""
+    title = (
+        "Thesis 4.3: run time for three agents, five steps, µ = 0, 0.25, 0.5, 0.75, 1 (ad hoc, transient scenario)",
+        "sampled and approximate values are those of `stochfuse compare`; seconds, wall clock, measured now",
+    )
+    keys = ("work", "thesis_s", "here_s")
+    cells = tuple((work, "-" if there is None else f"{there:,.0f}", f"{here:.4g}") for work, there, here in rows)
+    table = Table(title, ("work",), ("thesis [s]", "here [s]"), cells)
+    record = {**_head("timing"), "rows": [dict(zip(keys, row, strict=True)) for row in rows]}
+    return Report(lambda: table, partial(to_csv, keys, rows), lambda: record)
 
 
 def findings_table(findings: Sequence[Finding], title: Sequence[str] = (), *, everywhere: bool = True) -> Table:
@@ -166,17 +182,10 @@ def findings_table(findings: Sequence[Finding], title: Sequence[str] = (), *, ev
     ----------
     everywhere : whether it is said what each statement is about.
     """
-    rows = tuple(
-        (
-            *((where(finding.items),) if everywhere else ()),
-            finding.thesis,
-            f"{finding.ours} [{finding.criterion}]",
-            finding.verdict,
-        )
-        for finding in findings
-    )
-    keys = ("where",) if everywhere else ()
-    return Table((*title, MEANING), (*keys, "the thesis finds", "here [criterion]", "verdict"), (), rows)
+    rows = [(where(f.items), f.thesis, f"{f.ours} [{f.criterion}]", f.verdict) for f in findings]
+    keys = ("where", "the thesis finds", "here [criterion]", "verdict")
+    first = 0 if everywhere else 1
+    return Table((*title, MEANING), keys[first:], (), tuple(row[first:] for row in rows))
 
 
 def where(items: Sequence[str]) -> str:
@@ -188,67 +197,32 @@ def where(items: Sequence[str]) -> str:
     return ", ".join(f"{kind} {', '.join(numbers)}".strip() for kind, numbers in kinds.items())
 
 
-def listing_table(entries: Sequence[tuple[str, str]]) -> Table:
-    """Return what can be reproduced."""
-    title = ("What of the thesis can be reproduced: `stochfuse reproduce KEY`",)
-    return Table(title, ("key", "what it shows"), (), tuple(entries))
-
-
-def sheet_csv(sheets: Sequence[Sheet]) -> str:
-    """One line per point of every curve."""
-    rows = []
-    for sheet in sheets:
-        rows += [(sheet.key, "", name, "", "", there, here, "") for name, there, here in sheet.facts]
-        for panel in sheet.panels:
-            for curve in panel.curves:
-                for name, values in curve.rows(panel.x_label):
-                    rows += [
-                        (sheet.key, panel.title, name, panel.x_label, float(x), "", float(y), panel.y_label)
-                        for x, y in zip(panel.x, values, strict=True)
-                    ]
+def _sheet_csv(sheet: Sheet) -> str:
+    """One line per fact, and per point of every curve."""
+    rows = [(sheet.key, "", name, "", "", there, here, "") for name, there, here in sheet.facts]
+    for panel in sheet.panels:
+        for curve in panel.curves:
+            for name, values in curve.rows(panel.x_label):
+                rows += [
+                    (sheet.key, panel.title, name, panel.x_label, float(x), "", float(y), panel.y_label)
+                    for x, y in zip(panel.x, values, strict=True)
+                ]
     return to_csv(("item", "panel", "curve", "x_name", "x", "thesis", "value", "value_name"), rows)
 
 
-def findings_csv(findings: Sequence[Finding]) -> str:
-    """One line per statement."""
-    rows = [(" ".join(f.items), f.thesis, f.ours, f.criterion, f.verdict) for f in findings]
-    return to_csv(("items", "thesis", "ours", "criterion", "verdict"), rows)
-
-
-def sheet_json(sheet: Sheet) -> dict[str, Any]:
-    """Return one item as an object."""
+def _sheet_json(sheet: Sheet) -> dict[str, Any]:
     return {
         **_head(sheet.key),
         "title": sheet.title,
         "notes": list(sheet.notes),
         "panels": [_panel_json(panel) for panel in sheet.panels],
         "facts": [{"name": name, "thesis": there, "here": here} for name, there, here in sheet.facts],
-        "statements": [_finding_json(finding) for finding in sheet.findings],
+        "statements": list(map(asdict, sheet.findings)),
     }
-
-
-def findings_json(findings: Sequence[Finding]) -> dict[str, Any]:
-    """Return statements as an object."""
-    return {**_head("statements"), "verdicts": MEANING, "statements": [_finding_json(f) for f in findings]}
-
-
-def listing_json(entries: Sequence[tuple[str, str]]) -> dict[str, Any]:
-    """Return what can be reproduced as an object."""
-    return {**_head("list"), "items": [{"key": key, "title": title} for key, title in entries]}
 
 
 def _head(what: str) -> dict[str, Any]:
     return {"schema": SCHEMA, "version": __version__, "what": what}
-
-
-def _finding_json(finding: Finding) -> dict[str, Any]:
-    return {
-        "items": list(finding.items),
-        "thesis": finding.thesis,
-        "ours": finding.ours,
-        "criterion": finding.criterion,
-        "verdict": finding.verdict,
-    }
 
 
 def _panel_json(panel: Panel) -> dict[str, Any]:
@@ -276,26 +250,19 @@ def draw(sheet: Sheet):
 
 
 def _draw_panel(axes, panel: Panel) -> None:
-    own = any(curve.at is not None for curve in panel.curves)
     colors = shades(len(panel.curves))
     width = 0.8 / len(panel.curves)
     for i, (curve, color) in enumerate(zip(panel.curves, colors, strict=True)):
         x = panel.x if curve.at is None else curve.at
+        style: dict[str, Any] = {"color": color, "label": curve.name}
         if panel.bars:
-            axes.bar(x + (i - (len(panel.curves) - 1) / 2) * width, curve.y, width, color=color, label=curve.name)
+            axes.bar(x + (i - (len(panel.curves) - 1) / 2) * width, curve.y, width, **style)
             continue
-        axes.plot(
-            x,
-            curve.y,
-            linestyle=DASHES[i % len(DASHES)],
-            color=color,
-            marker=MARKERS[i % len(MARKERS)],
-            markersize=4,
-            label=curve.name,
-        )
+        style |= {"linestyle": DASHES[i % len(DASHES)], "marker": MARKERS[i % len(MARKERS)], "markersize": 4}
+        axes.plot(x, curve.y, **style)
         if curve.low is not None and curve.high is not None:
             axes.fill_between(x, curve.low, curve.high, color=color, alpha=0.15, linewidth=0)
-    if not own:
+    if all(curve.at is None for curve in panel.curves):
         axes.set_xticks(panel.x, panel.points)
     axes.set_xlabel(panel.x_label)
     axes.set_ylabel("\n".join(wrap(panel.y_label, 45)))

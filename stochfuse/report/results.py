@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import Any
 
 from stochfuse.errors import StochfuseError, UsageError
+from stochfuse.estimators.fusion_graph import FusionGraph
 from stochfuse.kalman.metrics import metric
 from stochfuse.prediction.compare import Comparison, EstimatorComparison
 from stochfuse.prediction.result import Prediction
@@ -15,7 +16,7 @@ from stochfuse.questions.critical import Critical
 from stochfuse.questions.least_link import LeastLink
 from stochfuse.questions.messages import MessageLoad
 from stochfuse.questions.sensitivity import Sensitivity, ShareOfGain
-from stochfuse.report import comparisons, messages, predictions, solutions, study_figures
+from stochfuse.report import comparisons, fusion_graph, messages, predictions, solutions, study_figures
 from stochfuse.report.critical import critical_report
 from stochfuse.report.plot import figure_class
 from stochfuse.report.predictions import PredictionView
@@ -87,6 +88,16 @@ def figure_of(result: Any, ax: Any = None, **shown: Any) -> Any:
         raise UsageError(f"ax: expected none, a {type(result).__name__} needs axes of its own")
     predictions.draw_on(ax, _view(result, **shown))
     return ax.figure
+
+
+def graph_text(graph: FusionGraph, agent: int, step: int) -> str:
+    """Return a fusion graph's explanation of an estimate in words."""
+    return fusion_graph.to_text([graph.explain(agent, step)])
+
+
+def graph_figure(graph: FusionGraph, agent: int, step: int) -> Any:
+    """Return a figure of the graph of an estimate."""
+    return fusion_graph.draw(graph, graph.explain(agent, step))
 
 
 def _view(p: Prediction, of: str | None = None, agent: int | str = "mean") -> PredictionView:

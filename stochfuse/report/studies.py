@@ -1,14 +1,13 @@
-"""What a study and its columns are, in words, and its keys' values as tables, figures and JSON have them.
+"""What a study found, in a few numbers, and what pays in it (Pareto), as table, CSV and JSON.
 
-What a study found, in a few numbers, and what pays in it (Pareto), as table, CSV and JSON.
+Every form is made from the same records, one for each extreme or point of the front.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -22,9 +21,9 @@ from stochfuse.studies.plan import ERROR, NODES, Plan
 
 if TYPE_CHECKING:
     from stochfuse.studies.files import Results
-    from stochfuse.studies.plan import Plan
 
-
+SCHEMA = "stochfuse.study-summary/1"
+PARETO_SCHEMA = "stochfuse.pareto/1"
 EXPECTED = ("claimed", "actual", OPTIMAL)
 """Quantities that are themselves expectations."""
 HOW = ("method", "estimator", "nature")
@@ -120,23 +119,19 @@ def study_json(plan: Plan) -> dict[str, Any]:
     }
 
 
-SCHEMA = "stochfuse.study-summary/1"
-PARETO_SCHEMA = "stochfuse.pareto/1"
-
-
 ROUNDING = 1e-12
 """Relative difference of values that are equal: which is the larger is the machine's business."""
 
 
 class Extreme(NamedTuple):
-    """The least or greatest value of a column, and where it is.
+    """The least or greatest value of a column after each point's last step, and where it is.
 
     Parameters
     ----------
     column, extreme : which column, "least" or "greatest".
     value, point, step : the value, its point and that point's last step.
     keys : the point's values of every varied key.
-    method, estimator, nature : how it was predicted.
+    how : method, estimator and nature, see `HOW`.
     """
 
     column: str
@@ -145,18 +140,15 @@ class Extreme(NamedTuple):
     point: int
     step: int
     keys: Mapping[str, Any]
-    method: str
-    estimator: str
-    nature: str
+    how: Mapping[str, str]
 
 
-@dataclass(frozen=True, eq=False)
-class Summary:
+class Summary(NamedTuple):
     """What a study found, in a few numbers.
 
     Parameters
     ----------
-    extremes : least and greatest value of every value column after each point's last step.
+    extremes : of every value column.
     natures : how many points are exact, approximate, bound, sampled.
     """
 
@@ -181,37 +173,27 @@ def summarise(results: Results) -> Summary:
             for extreme, sign in (("least", 1), ("greatest", -1)):
                 best = found.get((column, extreme))
                 end = sign * np.nanmin(sign * values)
-                near = np.abs(values - end) <= ROUNDING * np.abs(end)
-                here = _extreme(column, extreme, block, int(near.argmax()), keys)
-                if best is None or sign * (best.value - here.value) > ROUNDING * abs(best.value):
-                    found[column, extreme] = here
+                i = int((np.abs(values - end) <= ROUNDING * np.abs(end)).argmax())
+                if best is None or sign * (best.value - values[i]) > ROUNDING * abs(best.value):
+                    at, how = ({name: plain(block[name][i]) for name in names} for names in (keys, HOW))
+                    where = (int(block[name][i]) for name in ("point", "step"))
+                    found[column, extreme] = Extreme(column, extreme, float(values[i]), *where, at, how)
     order = [(column, extreme) for column in plan.columns for extreme in ("least", "greatest")]
     return Summary(tuple(found[at] for at in order if at in found), dict(sorted(natures.items())))
 
 
-def _extreme(column: str, extreme: str, block: Mapping[str, np.ndarray], i: int, keys: Sequence[str]) -> Extreme:
-    at = {key: plain(block[key][i]) for key in keys}
-    how = (str(block[name][i]) for name in HOW)
-    return Extreme(column, extreme, float(block[column][i]), int(block["point"][i]), int(block["step"][i]), at, *how)
-
-
 def summary_table(results: Results, digits: int = 5) -> Table:
     """Return least and greatest value of every value column, with the point where, under what the study is."""
-    summary, plan = summarise(results), results.plan
-    keys = [axis.name for axis in plan.axes]
-    words = [words_of(axis.values) for axis in plan.axes]
+    summary = summarise(results)
+    known = {axis.name: words_of(axis.values) for axis in results.plan.axes}
     rows = tuple(
         (
-            e.column,
-            e.extreme,
-            number(e.value, digits),
-            str(e.point),
-            str(e.step),
-            *(shortened(e.keys[key], known) for key, known in zip(keys, words, strict=True)),
+            *(e.column, e.extreme, number(e.value, digits), str(e.point), str(e.step)),
+            *(shortened(value, known[key]) for key, value in e.keys.items()),
         )
         for e in summary.extremes
     )
-    return Table(titles(results, summary), ("column", ""), ("value", "point", "k", *keys), rows)
+    return Table(titles(results, summary), ("column", ""), ("value", "point", "k", *known), rows)
 
 
 def titles(results: Results, summary: Summary) -> tuple[str, ...]:
@@ -241,55 +223,32 @@ def _together(errors: Sequence[tuple[int, str]]) -> list[tuple[str, str]]:
 
 def summary_csv(results: Results) -> str:
     """One line per value column and extreme, with the point where it is."""
-    summary, plan = summarise(results), results.plan
+    plan = results.plan
+    of_study = {"study": plan.name, "points": plan.size, "rows": results.rows, "failed": results.failed}
+    records = [
+        {
+            **of_study,
+            **{"column": e.column, "label": spoken(plan, e.column), "extreme": e.extreme},
+            **{"value": e.value, "point": e.point, "step": e.step, **e.how, **e.keys},
+        }
+        for e in summarise(results).extremes
+    ]
     keys = [axis.name for axis in plan.axes]
-    how = [name for name in HOW if name not in keys]
-    headings = (
-        "study",
-        "points",
-        "rows",
-        "failed",
-        "column",
-        "label",
-        "extreme",
-        "value",
-        "point",
-        "step",
-        *keys,
-        *how,
-    )
-    start = (plan.name, plan.size, results.rows, results.failed)
-    return to_csv(
-        headings,
-        [
-            (
-                *start,
-                e.column,
-                spoken(plan, e.column),
-                e.extreme,
-                e.value,
-                e.point,
-                e.step,
-                *e.keys.values(),
-                *(getattr(e, name) for name in how),
-            )
-            for e in summary.extremes
-        ],
-    )
+    told = ("column", "label", "extreme", "value", "point", "step")
+    return _csv((*of_study, *told, *keys, *(name for name in HOW if name not in keys)), records)
+
+
+def _csv(headings: Sequence[str], records: Iterable[Mapping[str, Any]]) -> str:
+    return to_csv(headings, [[record[name] for name in headings] for record in records])
 
 
 def summary_json(results: Results) -> dict[str, Any]:
-    """Return the object of schema stochfuse.study/1."""
+    """Return the object of schema stochfuse.study-summary/1."""
     summary, plan = summarise(results), results.plan
     columns: dict[str, Any] = {column: {"label": spoken(plan, column)} for column in plan.columns}
     for e in summary.extremes:
-        columns[e.column][e.extreme] = {
-            "value": e.value,
-            "point": e.point,
-            "step": e.step,
-            "keys": {key: json_of(value) for key, value in e.keys.items()},
-            **{name: getattr(e, name) for name in HOW},
-        }
+        keys = {key: json_of(value) for key, value in e.keys.items()}
+        columns[e.column][e.extreme] = {"value": e.value, "point": e.point, "step": e.step, "keys": keys, **e.how}
     return {
         "schema": SCHEMA,
         "version": __version__,
@@ -305,14 +264,30 @@ def summary_json(results: Results) -> dict[str, Any]:
     }
 
 
+def _front(found: ParetoFront) -> Iterator[dict[str, Any]]:
+    """A record for each point of the front, by rising load: its costs, its keys, and how it was predicted."""
+    for i, point in enumerate(found.points.tolist()):
+        error = None if found.error is None or not np.isfinite(found.error[i]) else float(found.error[i])
+        yield {
+            "point": point,
+            "step": int(found.steps[i]),
+            "load": float(found.load[i]),
+            "accuracy": float(found.accuracy[i]),
+            "standard_error": error,
+            "keys": {key: plain(values[i]) for key, values in found.keys.items()},
+            **{name: str(getattr(found, name)[i]) for name in HOW},
+        }
+
+
 def pareto_titles(found: ParetoFront, results: Results) -> tuple[str, ...]:
     """Lines that say what is compared and how exact it is."""
-    plan = results.plan
+    plan, n = results.plan, len(found.points)
+    these = "this one" if n == 1 else f"these {n:,}"
     natures = ", ".join(sorted(set(found.nature.tolist())))
     when = "each point's last step" if found.step is None else f"step {found.step}"
     fixed = "".join(f", {name} = {shortened(value)}" for name, value in _fixed(found, plan).items())
     return (
-        f"Study {plan.name}: accuracy against message load; no point does better in both than {_these(found)}",
+        f"Study {plan.name}: accuracy against message load; no point does better in both than {these}",
         f"Scenario {plan.scenario_name}; {whose(plan)}; {counted(found.compared, 'point')} compared{fixed}, "
         f"{failures(results.failed)}",
         f"load: {load_label(plan)}",
@@ -321,32 +296,19 @@ def pareto_titles(found: ParetoFront, results: Results) -> tuple[str, ...]:
     )
 
 
-def _these(found: ParetoFront) -> str:
-    n = len(found.points)
-    return "this one" if n == 1 else f"these {n:,}"
-
-
 def pareto_table(found: ParetoFront, results: Results, digits: int = 5) -> Table:
     """Return the front by rising load, with the keys of its points, under what is compared."""
-    how = _how(found)
     told = _fixed(found, results.plan)
-    shown_keys = {a.name: words_of(a.values) for a in results.plan.axes if a.name not in told}
-    errors = np.full(len(found.points), np.nan) if found.error is None else found.error
+    known = {axis.name: words_of(axis.values) for axis in results.plan.axes if axis.name not in told}
+    # what all points have in common, or a key says, is no column
+    how = [name for name in HOW if name not in found.keys and len(set(getattr(found, name).tolist())) > 1]
     rows = []
-    for i, (load, accuracy, error) in enumerate(zip(found.load, found.accuracy, errors, strict=True)):
-        cells = [shortened(found.keys[key][i], known) for key, known in shown_keys.items()]
-        sampled = f" ±{error:.2g}" if np.isfinite(error) else ""
-        shown = number(float(load), digits) if load else "0"
-        rows.append(
-            (
-                str(found.points[i]),
-                shown,
-                number(float(accuracy), digits) + sampled,
-                *cells,
-                *(str(h[i]) for h in how.values()),
-            )
-        )
-    return Table(pareto_titles(found, results), ("point",), ("load", "accuracy", *shown_keys, *how), tuple(rows))
+    for p in _front(found):
+        sampled = "" if p["standard_error"] is None else f" ±{p['standard_error']:.2g}"
+        load = number(p["load"], digits) if p["load"] else "0"
+        keys = [shortened(p["keys"][key], words) for key, words in known.items()]
+        rows.append((str(p["point"]), load, number(p["accuracy"], digits) + sampled, *keys, *(p[name] for name in how)))
+    return Table(pareto_titles(found, results), ("point",), ("load", "accuracy", *known, *how), tuple(rows))
 
 
 def _fixed(found: ParetoFront, plan: Plan) -> dict[str, Any]:
@@ -355,44 +317,20 @@ def _fixed(found: ParetoFront, plan: Plan) -> dict[str, Any]:
     return {**single, **found.fixed}
 
 
-def _how(found: ParetoFront) -> dict[str, np.ndarray]:
-    """Method, estimator and nature as far as points differ in them and no key says it."""
-    each = {name: getattr(found, name) for name in HOW if name not in found.keys}
-    return {name: values for name, values in each.items() if len(set(values.tolist())) > 1}
-
-
 def pareto_csv(found: ParetoFront, results: Results) -> str:
     """One line per point of the front, with everything that says what it is."""
+    of_study = {"study": results.plan.name, "column": found.column, "label": spoken(results.plan, found.column)}
     how = [name for name in HOW if name not in found.keys]
-    headings = ("study", "point", "step", "load", "column", "label", "accuracy", "standard_error", *found.keys, *how)
-    label = spoken(results.plan, found.column)
-    rows = []
-    for i, point in enumerate(found.points.tolist()):
-        error = "" if found.error is None or not np.isfinite(found.error[i]) else float(found.error[i])
-        keys = [plain(values[i]) for values in found.keys.values()]
-        start = (results.plan.name, point, int(found.steps[i]), float(found.load[i]))
-        rows.append(
-            (*start, found.column, label, float(found.accuracy[i]), error, *keys, *(getattr(found, n)[i] for n in how))
-        )
-    return to_csv(headings, rows)
+    told = ("study", "point", "step", "load", "column", "label", "accuracy", "standard_error")
+    return _csv((*told, *found.keys, *how), ({**of_study, **point, **point["keys"]} for point in _front(found)))
 
 
 def pareto_json(found: ParetoFront, results: Results) -> dict[str, Any]:
     """Return the object of schema stochfuse.pareto/1."""
     points = []
-    for i, point in enumerate(found.points.tolist()):
-        error = None if found.error is None or not np.isfinite(found.error[i]) else float(found.error[i])
-        points.append(
-            {
-                "point": point,
-                "step": int(found.steps[i]),
-                "load": float(found.load[i]),
-                "accuracy": float(found.accuracy[i]),
-                **({} if error is None else {"standard_error": error}),
-                "keys": {key: json_of(values[i]) for key, values in found.keys.items()},
-                **{name: str(getattr(found, name)[i]) for name in HOW},
-            }
-        )
+    for point in _front(found):
+        point["keys"] = {key: json_of(value) for key, value in point["keys"].items()}
+        points.append({name: value for name, value in point.items() if value is not None})
     return {
         "schema": PARETO_SCHEMA,
         "version": __version__,

@@ -1,15 +1,8 @@
-"""A study's values over one or two keys as a figure (matplotlib, extra `plot`).
-
-Axes, scales and colours of a study's figures (matplotlib).
+"""A study's values over one or two keys, and accuracy against message load, as figures (matplotlib, extra `plot`).
 
 Colours are those of cividis, which rise in lightness alone: they are the same in grey print and to the colour-blind.
-
-Heat maps and contours of a study's values over two keys (matplotlib).
-
 Cells of a heat map meet half way between neighbouring values, on a log axis at their geometric mean, and reach as far
 outwards at the ends; contours go through the values themselves.
-
-Accuracy against message load as a figure: all points of a study, and the front of those that pay (matplotlib).
 """
 
 from __future__ import annotations
@@ -23,7 +16,7 @@ import numpy as np
 
 from stochfuse.errors import UsageError
 from stochfuse.report import studies
-from stochfuse.report.plot import COLORS, MARKERS, figure_class, spread
+from stochfuse.report.plot import COLORS, DASHES, MARKERS, figure_class, spread
 from stochfuse.report.predictions import counted
 from stochfuse.report.studies import LONGEST, load_label, shortened, spoken, whose, words_of
 from stochfuse.report.study_slices import (
@@ -40,16 +33,43 @@ from stochfuse.report.study_slices import (
 )
 from stochfuse.report.table import Report, number
 from stochfuse.studies.pareto import ParetoFront
-from stochfuse.studies.plan import NODES, Axis
+from stochfuse.studies.plan import NODES, Axis, Plan
 
 if TYPE_CHECKING:
     from stochfuse.studies.files import Results
 
 
 KINDS = ("heat", "contour")
-STYLES = ("-", "--", ":", "-.")
+SIZE = (7.5, 5.6)
 MANY = 1000
 """Scattered points from which on they are drawn small, and as pixels even in vector files."""
+
+
+COLOURS = "cividis"
+RATIO = 30.0
+"""Ratio of the greatest to the least number above which they are drawn on a log scale."""
+SMALL = 9
+"""Points of the smaller print."""
+BELOW: dict[str, Any] = {"fontsize": SMALL, "loc": "upper center", "bbox_to_anchor": (0.5, -0.14), "frameon": False}
+"""A legend below the axes, where it hides nothing."""
+MOST_TICKS = 14
+NAMES = {
+    "network.link": "link probability µ",
+    "network.agents": "number of agents",
+    "network.steps": "number of steps",
+    "network.architecture": "architecture",
+    "model.R": "measurement noise R",
+    "model.Q": "process noise Q",
+    "initial.P": "initial covariance P(k0)",
+}
+MOST_ACROSS, MOST_DOWN = 11, 16
+"""Cells up to which each has its number written in it."""
+MARGIN, APART = 0.03, 0.06
+"""Shares of the axes: of the rim without labels, and of the distance between labels."""
+MANY_POINTS = 500
+"""Points of a front's figure from which on they are drawn small, and as pixels even in vector files."""
+NUMBERS_APART, DIGIT = 0.02, 0.013
+"""Shares of the axes: between the numbers of points, and of the width of a digit."""
 
 
 def summary_report(results: Results, digits: int, drawn: tuple[Any, ...] = ()) -> Report:
@@ -104,13 +124,12 @@ def draw(
     StochfuseError
         If matplotlib is not installed.
     """
-    Figure = figure_class()
     if kind not in KINDS:
         raise UsageError(f"kind: expected {' or '.join(KINDS)}, got {kind}")
     shown = sliced(results, keys, column, where, step)
     if kind == "contour":
         _check_contours(shown)
-    figure = Figure(figsize=(7.5, 5.6), layout="constrained")
+    figure = figure_class()(figsize=SIZE, layout="constrained")
     axes = figure.add_subplot()
     # scales first: labels of contours are placed on them
     for which, axis in zip("xy", shown.over, strict=False):
@@ -121,9 +140,7 @@ def draw(
         _lines(axes, shown)
     else:
         (draw_heat if kind == "heat" else draw_contour)(axes, shown)
-    title = spoken(shown.plan, shown.column)
-    figure.suptitle(wrapped(title[0].upper() + title[1:], 80), fontsize="medium")
-    axes.set_title("\n".join(wrapped(text, 95) for text in _about(shown)), fontsize=SMALL)
+    _entitle(axes, spoken(shown.plan, shown.column), shown.plan, _about(shown))
     return figure
 
 
@@ -138,29 +155,27 @@ def _check_contours(shown: Slice) -> None:
 def _scatter(axes: Any, shown: Slice) -> None:
     """Draw the points of a list or Latin hypercube, coloured by value over two keys."""
     x = positions(shown.over[0], shown.data[shown.over[0].name])
-    many = len(x) > MANY
-    groups = groups_of(shown.data, shown.marked)
-    if len(shown.over) == 1:
-        for i, (name, there) in enumerate(groups):
-            style: dict[str, Any] = {"s": 8 if many else 22, "color": COLORS[i % len(COLORS)], "rasterized": many}
-            axes.scatter(x[there], shown.values[there], marker=MARKERS[i % len(MARKERS)], label=name, **style)
-        _value_axis(axes, shown)
-    else:
+    over_two, many = len(shown.over) == 2, len(x) > MANY
+    style: dict[str, Any] = {"s": 8 if many else 22, "rasterized": many}
+    if over_two:
         y = positions(shown.over[1], shown.data[shown.over[1].name])
         draw_triangles(axes, shown, x, y)
-        style = {"s": 9 if many else 30, "linewidth": 0.0 if many else 0.5, "edgecolor": "black", "cmap": COLOURS}
-        style |= {"norm": norm_of(shown.values), "rasterized": many}
-        drawn = []
-        for i, (name, there) in enumerate(groups):
-            style |= {"c": shown.values[there], "marker": MARKERS[i % len(MARKERS)]}
-            drawn.append(axes.scatter(x[there], y[there], label=name, **style))
+        style |= {"s": 9 if many else 30, "linewidth": 0.0 if many else 0.5, "edgecolor": "black"}
+        style |= {"cmap": COLOURS, "norm": norm_of(shown.values)}
+    else:
+        y = shown.values
+    drawn = []
+    for i, (name, there) in enumerate(groups_of(shown.data, shown.marked)):
+        colour = {"c": shown.values[there]} if over_two else {"color": COLORS[i % len(COLORS)]}
+        drawn.append(axes.scatter(x[there], y[there], marker=MARKERS[i % len(MARKERS)], label=name, **colour, **style))
+    if over_two:
         colour_bar(axes, drawn[0], shown.values, spoken(shown.plan, shown.column))
+    else:
+        _value_axis(axes, shown)
     if shown.marked:
         legend = axes.legend(title=shown.marked, ncols=4, **BELOW)
         for handle in legend.legend_handles:
-            handle.set(sizes=[30])
-            if len(shown.over) == 2:
-                handle.set(facecolor="0.5", array=None)
+            handle.set(sizes=[30], **({"facecolor": "0.5", "array": None} if over_two else {}))
 
 
 def _lines(axes: Any, shown: Slice) -> None:
@@ -176,7 +191,7 @@ def _lines(axes: Any, shown: Slice) -> None:
         y[at[there]] = shown.values[there]
         gone[i] = np.isnan(y)
         style: dict[str, Any] = {"color": COLORS[i], "marker": MARKERS[i] if len(x) <= 40 else None, "markersize": 5}
-        style["linestyle"] = "none" if is_text(axis) else STYLES[i % len(STYLES)]
+        style["linestyle"] = "none" if is_text(axis) else DASHES[i % len(DASHES)]
         axes.plot(x, y, label=shortened(listed[c], words_of(listed)) if other else None, **style)
     if gone.any():
         some = x[gone.any(axis=0)]
@@ -198,37 +213,27 @@ def _value_axis(axes: Any, shown: Slice) -> None:
 
 
 def _about(shown: Slice) -> list[str]:
-    """Which study; when, how and how exact; what else there is."""
+    """When, how and how exact it is; what else there is."""
     plan, steps = shown.plan, shown.data["step"]
     first, last = int(steps.min()), int(steps.max())
     when = f"after step {first}" if first == last else f"after each point's last step ({first} to {last})"
     fixed = [f"{name} = {shortened(value)}" for name, value in shown.fixed.items()]
-    lines = [f"Study {plan.name}, scenario {plan.scenario_name}; {whose(plan)}"]
-    lines.append("; ".join([when, *fixed, natures_of(shown.data)]))
     unseen = [axis.name for axis in shown.also if axis.name != shown.marked]
     more = [f"also varying: {', '.join(unseen)}"] if unseen and plan.kind != "grid" else []
     more += [f"about one of {shown.one_in} points drawn"] if shown.one_in > 1 else []
-    more += [f"{counted(shown.failed, 'failed point')} not drawn"] if shown.failed and plan.kind != "grid" else []
-    return [*lines, "; ".join(more)] if more else lines
+    more += [_not_drawn(shown.failed)] if shown.failed and plan.kind != "grid" else []
+    return ["; ".join([when, *fixed, natures_of(shown.data)]), "; ".join(more)]
 
 
-COLOURS = "cividis"
-RATIO = 30.0
-"""Ratio of the greatest to the least number above which they are drawn on a log scale."""
-SMALL = 9
-"""Points of the smaller print."""
-BELOW: dict[str, Any] = {"fontsize": SMALL, "loc": "upper center", "bbox_to_anchor": (0.5, -0.14), "frameon": False}
-"""A legend below the axes, where it hides nothing."""
-MOST_TICKS = 14
-NAMES = {
-    "network.link": "link probability µ",
-    "network.agents": "number of agents",
-    "network.steps": "number of steps",
-    "network.architecture": "architecture",
-    "model.R": "measurement noise R",
-    "model.Q": "process noise Q",
-    "initial.P": "initial covariance P(k0)",
-}
+def _not_drawn(failed: int) -> str:
+    return f"{counted(failed, 'failed point')} not drawn"
+
+
+def _entitle(axes: Any, title: str, plan: Plan, lines: Sequence[str]) -> None:
+    """Write the title, and under it which study it is and the lines that are not empty."""
+    axes.figure.suptitle(wrapped(title[0].upper() + title[1:], 80), fontsize="medium")
+    whole = [f"Study {plan.name}, scenario {plan.scenario_name}; {whose(plan)}", *filter(None, lines)]
+    axes.set_title("\n".join(wrapped(line, 95) for line in whole), fontsize=SMALL)
 
 
 def wrapped(text: str, width: int) -> str:
@@ -252,13 +257,13 @@ def norm_of(values: np.ndarray) -> Any:
     return Normalize(low, high) if high > low else Normalize(low - around, low + around)
 
 
-def levels_of(values: np.ndarray, number: int = 9) -> np.ndarray:
+def levels_of(values: np.ndarray) -> np.ndarray:
     """Return round levels from below the least value to above the greatest: 1, 2, 5, 10, … on a log scale."""
     from matplotlib.ticker import MaxNLocator
 
     low, high = float(np.min(values)), float(np.max(values))
     if not wide(values):
-        return np.asarray(MaxNLocator(number).tick_values(low, high))
+        return np.asarray(MaxNLocator(9).tick_values(low, high))
     # one decade more at both ends, since logarithms are rounded
     decades = np.arange(np.floor(np.log10(low)) - 1, np.ceil(np.log10(high)) + 2)
     digits = (1.0, 2.0, 5.0) if high <= 1e4 * low else (1.0,)
@@ -323,12 +328,6 @@ def groups_of(data: Mapping[str, np.ndarray], marked: str | None) -> list[tuple[
         return [("", np.ones(len(data["point"]), dtype=bool))]
     values = data[marked].astype(str)
     return [(name, values == name) for name in dict.fromkeys(values.tolist())]
-
-
-MOST_ACROSS, MOST_DOWN = 11, 16
-"""Cells up to which each has its number written in it."""
-MARGIN, APART = 0.03, 0.06
-"""Shares of the axes: of the rim without labels, and of the distance between labels."""
 
 
 def edges(values: Sequence[float] | np.ndarray, log: bool = False) -> np.ndarray:
@@ -403,9 +402,7 @@ def draw_contour(axes: Any, shown: Slice) -> None:
     inside = values.compressed()
     if min(values.shape) < 2 or inside.min() == inside.max():
         raise UsageError("kind: expected heat where values do not differ along both keys, got contour")
-    levels = levels_of(inside)
-    filled = axes.contourf(x, y, values, levels=levels, cmap=COLOURS, norm=norm_of(inside))
-    label(axes, axes.contour(x, y, values, levels=levels, colors="black", linewidths=0.8))
+    filled = _contours(axes, axes.contourf, axes.contour, (x, y, values), inside)
     colour_bar(axes, filled, inside, spoken(shown.plan, shown.column))
     missing = np.ma.getmaskarray(values)
     if missing.any():
@@ -414,7 +411,15 @@ def draw_contour(axes: Any, shown: Slice) -> None:
         axes.legend(**BELOW)
 
 
-def label(axes: Any, lines: Any) -> None:
+def _contours(axes: Any, fill: Any, draw_lines: Any, field: tuple[Any, ...], values: np.ndarray) -> Any:
+    """Draw round levels of a field, filled and as lines with their values on them; return what is filled."""
+    levels = levels_of(values)
+    filled = fill(*field, levels=levels, cmap=COLOURS, norm=norm_of(values))
+    _label(axes, draw_lines(*field, levels=levels, colors="black", linewidths=0.8))
+    return filled
+
+
+def _label(axes: Any, lines: Any) -> None:
     """Write its value on every line that has room for it, away from the rim and from other labels."""
     from matplotlib.patheffects import withStroke
 
@@ -445,43 +450,25 @@ def draw_triangles(axes: Any, shown: Slice, x: np.ndarray, y: np.ndarray) -> Non
         triangles = Triangulation(unit(shown.over[0], x), unit(shown.over[1], y)).triangles
     except (RuntimeError, ValueError):  # fewer than three points, or all on one line
         return
-    levels, found = levels_of(shown.values), Triangulation(x, y, triangles)
-    axes.tricontourf(found, shown.values, levels=levels, cmap=COLOURS, norm=norm_of(shown.values))
-    label(axes, axes.tricontour(found, shown.values, levels=levels, colors="black", linewidths=0.8))
-
-
-MANY_POINTS = 500
-"""Points from which on they are drawn small, and as pixels even in vector files."""
-APART, DIGIT = 0.02, 0.013
-"""Shares of the axes: between the numbers of points, and of the width of a digit."""
+    found = Triangulation(x, y, triangles)
+    _contours(axes, axes.tricontourf, axes.tricontour, (found, shown.values), shown.values)
 
 
 def draw_pareto(found: ParetoFront, results: Results) -> Any:
     """Draw all points, and the front as a line of steps: the best accuracy at no more than so much load."""
-    figure = figure_class()(figsize=(7.5, 5.6), layout="constrained")
+    figure = figure_class()(figsize=SIZE, layout="constrained")
     axes = figure.add_subplot()
     one_in = -(-found.compared // MOST_DRAWN)
     load, accuracy = _all(found, results, one_in)
     for which, values in (("x", np.append(load, found.load)), ("y", np.append(accuracy, found.accuracy))):
         axes.set(**{f"{which}scale": "log" if wide(values) else "linear"})
-    share = f"about one of {one_in} of " if one_in > 1 else ""
-    style: dict[str, Any] = {
-        "s": 6 if len(load) > MANY_POINTS else 16,
-        "rasterized": len(load) > MANY_POINTS,
-        "linewidth": 0,
-    }
-    name = f"{share}{counted(found.compared, 'point')}"
-    axes.scatter(load, accuracy, color="0.75", label=name, zorder=1, **style)
-    axes.plot(
-        found.load,
-        found.accuracy,
-        color="black",
-        linewidth=1,
-        drawstyle="steps-post",
-        zorder=2,
-        label="front, with numbers of points",
-    )
-    _front(axes, found, results)
+    name = f"about one of {one_in} of " if one_in > 1 else ""
+    many = len(load) > MANY_POINTS
+    style: dict[str, Any] = {"s": 6 if many else 16, "rasterized": many, "linewidth": 0, "color": "0.75", "zorder": 1}
+    axes.scatter(load, accuracy, label=f"{name}{counted(found.compared, 'point')}", **style)
+    style = {"color": "black", "linewidth": 1, "drawstyle": "steps-post", "zorder": 2}
+    axes.plot(found.load, found.accuracy, label="front, with numbers of points", **style)
+    _mark_front(axes, found, results.plan)
     axes.set_xlabel(wrapped(load_label(results.plan), 80))
     axes.set_ylabel(wrapped(spoken(results.plan, found.column), 50))
     for which in "xy":
@@ -489,8 +476,14 @@ def draw_pareto(found: ParetoFront, results: Results) -> Any:
             axes.set(**{f"{which}lim": (0, None)})
     axes.grid(alpha=0.3)
     axes.legend(ncols=3, **BELOW)
-    _name(axes, found)
-    _title(figure, axes, found, results)
+    _number_points(axes, found)
+    when = "each point's last step" if found.step is None else f"step {found.step}"
+    data = {"nature": found.nature, "method": found.method, "estimator": found.estimator}
+    more = ["bars: 95 % confidence"] if found.error is not None else []
+    more += [_not_drawn(results.failed)] if results.failed else []
+    more += [f"{name} = {shortened(value)}" for name, value in found.fixed.items()]
+    title = "Accuracy against message load: what no other point beats in both"
+    _entitle(axes, title, results.plan, [f"after {when}; front: {natures_of(data)}", "; ".join(more)])
     return figure
 
 
@@ -505,47 +498,25 @@ def _all(found: ParetoFront, results: Results, one_in: int) -> tuple[np.ndarray,
     return np.concatenate(loads), np.concatenate(accuracies)
 
 
-def _front(axes: Any, found: ParetoFront, results: Results) -> None:
+def _mark_front(axes: Any, found: ParetoFront, plan: Plan) -> None:
     """Mark the front's points, by method, estimator or architecture if one of these varies."""
-    marked = next((axis.name for axis in results.plan.axes if axis.name in MARKED and size_of(axis) > 1), None)
-    data = {**found.keys, "point": found.points}
-    for i, (name, there) in enumerate(groups_of(data, marked)):
-        style: dict[str, Any] = {
-            "marker": MARKERS[i % len(MARKERS)],
-            "color": COLORS[i % len(COLORS)],
-            "zorder": 3,
-            "clip_on": False,
-        }
+    marked = next((axis.name for axis in plan.axes if axis.name in MARKED and size_of(axis) > 1), None)
+    for i, (name, there) in enumerate(groups_of({**found.keys, "point": found.points}, marked)):
+        style: dict[str, Any] = {"marker": MARKERS[i % len(MARKERS)], "color": COLORS[i % len(COLORS)], "s": 32}
         label = f"front, {name}" if name else "not dominated"
-        axes.scatter(found.load[there], found.accuracy[there], s=32, label=label, **style)
+        axes.scatter(found.load[there], found.accuracy[there], label=label, zorder=3, clip_on=False, **style)
     if found.error is not None:
         bars = np.where(np.isfinite(found.error), 1.96 * found.error, 0.0)
         axes.errorbar(found.load, found.accuracy, bars, fmt="none", ecolor="black", capsize=2, linewidth=0.8, zorder=2)
 
 
-def _name(axes: Any, found: ParetoFront) -> None:
+def _number_points(axes: Any, found: ParetoFront) -> None:
     """Write the points' numbers beside them, where there is room."""
     to_axes = axes.transData - axes.transAxes
     places = to_axes.transform(np.stack([found.load, found.accuracy], axis=1))
     right, low = -1.0, 2.0
     for point, load, accuracy, place in zip(found.points, found.load, found.accuracy, places, strict=True):
-        if place[0] > right + APART or place[1] < low - 2 * APART:
+        if place[0] > right + NUMBERS_APART or place[1] < low - 2 * NUMBERS_APART:
             at: dict[str, Any] = {"xytext": (4, 4), "textcoords": "offset points", "fontsize": 8}
             axes.annotate(str(point), (load, accuracy), **at)
             right, low = place[0] + DIGIT * len(str(point)), place[1]
-
-
-def _title(figure: Any, axes: Any, found: ParetoFront, results: Results) -> None:
-    plan = results.plan
-    when = "each point's last step" if found.step is None else f"step {found.step}"
-    data = {"nature": found.nature, "method": found.method, "estimator": found.estimator}
-    lines = [
-        f"Study {plan.name}, scenario {plan.scenario_name}; {whose(plan)}",
-        f"after {when}; front: {natures_of(data)}",
-    ]
-    more = ["bars: 95 % confidence"] if found.error is not None else []
-    more += [f"{counted(results.failed, 'failed point')} not drawn"] if results.failed else []
-    more += [f"{name} = {shortened(value)}" for name, value in found.fixed.items()]
-    lines += ["; ".join(more)] if more else []
-    figure.suptitle("Accuracy against message load: what no other point beats in both", fontsize="medium")
-    axes.set_title("\n".join(wrapped(line, 95) for line in lines), fontsize=SMALL)

@@ -18,7 +18,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -215,15 +215,8 @@ class Columns:
         return found
 
 
-def write_result(
-    plan: Plan, answers: Iterator[tuple[range, Answers]], path: Path, told: Callable[[int], None] = lambda points: None
-) -> dict[str, Any]:
-    """Write all answers of a plan, in their order, as Parquet or CSV by the file's name.
-
-    Parameters
-    ----------
-    answers : points and their answers.
-    told : told how many points are written.
+def write_result(plan: Plan, answers: Iterator[tuple[range, Answers]], path: Path) -> dict[str, Any]:
+    """Write points and their answers, in their order, as Parquet or CSV by the file's name.
 
     Returns
     -------
@@ -237,7 +230,6 @@ def write_result(
             file.write(columns.of(points, found))
             rows, failed = rows + int(found.rows.sum()), failed + len(found.errors)
             first += list(found.errors.items())[: FIRST_ERRORS - len(first)]
-            told(points.stop)
     return {"points": plan.size, "rows": rows, "failed": failed, "first_errors": first}
 
 

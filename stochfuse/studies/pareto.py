@@ -66,10 +66,10 @@ def front(cost_a: np.ndarray, cost_b: np.ndarray) -> np.ndarray:
     return order[(b < least_before)[fresh][np.cumsum(fresh) - 1]]
 
 
-def rounded(costs: np.ndarray, bits: int = COMPARED_BITS) -> np.ndarray:
-    """Return numbers rounded to so many significant bits."""
+def rounded(costs: np.ndarray) -> np.ndarray:
+    """Return numbers rounded to `COMPARED_BITS` significant bits."""
     mantissa, exponent = np.frexp(np.asarray(costs, dtype=float))
-    return np.ldexp(np.rint(np.ldexp(mantissa, bits)), exponent - bits)
+    return np.ldexp(np.rint(np.ldexp(mantissa, COMPARED_BITS)), exponent - COMPARED_BITS)
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,4 @@
-"""Records of truth and measurements: one world that the thesis holds fixed while it draws links.
-
-A record is a vector s of the independent noises in units of their own deviations, as `stochfuse.estimators.world`
-orders them:
-the agents' initial errors, then for every step 2 … K the process noise and the agents' measurement noises; and 1 for
-the known initial error.  Two things that the thesis leaves unsaid can be varied:
-
-    "own"      every agent draws its own initial estimate and its own measurements
-    "start"    one initial estimate for all agents (fused as if each had its own)
-    "all"      one initial estimate and one measurement of each step for all agents
-
-The numbers behind the thesis' figures, each calculated once: claimed covariances, error weights, message loads.
+"""The numbers behind the thesis' figures, each calculated once: claimed covariances, errors, message loads.
 
 Every estimate here is linear in independent noises.  In one outcome of "which messages arrive" its error is x·s, where
 s holds the noises in units of their own deviations (and a last entry 1 for the known initial error) and x is the
@@ -19,6 +8,13 @@ estimate's noise footprint (`stochfuse.estimators.world`).  Averaged over the ou
 
 for one record s of truth and measurements, which is what the thesis averages (it keeps one record for all its runs),
 and with E over s as well, the average over noise.  E[x] and E[x xᵀ] are exact: every outcome is gone through.
+
+A record has, in this order, the agents' initial errors, then for every step 2 … K the process noise and the agents'
+measurement noises.  Whose data the agents have, the thesis leaves unsaid:
+
+    "own"      every agent draws its own initial estimate and its own measurements
+    "start"    one initial estimate for all agents (fused as if each had its own)
+    "all"      one initial estimate and one measurement of each step for all agents
 
 The simplified formulation (53) has one estimate instead of outcomes; its footprint is read off `predict_states` by
 giving it unit data, each agent with data of its own.  Its initial estimates are taken as independent, as in (54): of
@@ -42,73 +38,19 @@ from stochfuse.questions.messages import MessageLoad, message_load
 from stochfuse.scenario.registry import LFG, MONTE_CARLO, SIMPLIFIED
 from stochfuse.scenario.scenario import Scenario, link_rows, load_scenario
 
-WINDOWS = ((6, 10), (6, 12))
-"""Steps that the thesis states, and those that its maxima need."""
-TABLE_3 = {
-    "ad-hoc": ((0.0, 0, 0.0), (1.820, 22, 2.843), (1.992, 16, 1.974), (1.988, 8, 1.146), (2.0, 2, 0.0)),
-    "broadcast": ((0.0, 0, 0.0), (1.823, 24, 2.896), (1.991, 18, 1.970), (1.982, 9, 1.154), (2.0, 2, 0.0)),
-    "cyclic": ((0.0, 0, 0.0), (1.491, 23, 3.432), (1.858, 21, 2.766), (1.943, 11, 1.694), (2.0, 2, 0.0)),
-}
-"""Mean, maximum and standard deviation at µ = 0, 0.25, 0.5, 0.75, 1: thesis table 3, 3 agents, 1000 runs."""
-
-
-class RecordMoments(NamedTuple):
-    """Mean, largest and standard deviation of a load in nodes."""
-
-    mean: float
-    maximum: int
-    std: float
-
-
-class Row(NamedTuple):
-    """One entry of table 3 beside ours.
-
-    Parameters
-    ----------
-    column : the thesis' heading: "ad-hoc", "broadcast" or "cyclic".
-    link : µ.
-    thesis : its moments; the maximum is that of 1000 runs.
-    ours : by (architecture, first step, last step), exact; the maximum is the largest that is possible.
-    """
-
-    column: str
-    link: float
-    thesis: RecordMoments
-    ours: dict[tuple[str, int, int], RecordMoments]
-
-
-def table_3_rows() -> tuple[Row, ...]:
-    """Return table 3 of the thesis and what the exact walk gives for it.
-
-    Beside its *ad hoc* column stand an ad hoc and a broadcast draw; the windows are `WINDOWS`.
-    """
-    link = np.linspace(0.0, 1.0, 5)
-    loads = {}
-    for architecture in TABLE_3:
-        whole = message_load(load_scenario(agents=3, steps=12, architecture=architecture, uniform_link=True), link)
-        for window in WINDOWS:
-            load = whole.between(*window)
-            moments = zip(load.mean().tolist(), load.maximum().tolist(), load.std().tolist(), strict=True)
-            loads[architecture, *window] = [RecordMoments(*m) for m in moments]
-    return tuple(
-        Row(
-            column,
-            float(µ),
-            RecordMoments(*thesis[i]),
-            {
-                key: moments[i]
-                for key, moments in loads.items()
-                if key[0] == column or (column, key[0]) == ("ad-hoc", "broadcast")
-            },
-        )
-        for column, thesis in TABLE_3.items()
-        for i, µ in enumerate(link)
-    )
-
-
+LINKS = (0.0, 0.25, 0.5, 0.75, 1.0)
+ARCHITECTURES = ("ad-hoc", "broadcast", "cyclic")
 DATA = ("own", "start", "all")
 TRUTH = 1000.0
 """True state at step 1, the mean of the thesis' x(0)."""
+STATED_WINDOW, WINDOW = (6, 10), (6, 12)
+"""Steps over which message loads are averaged: as the thesis says, and as the maxima of its table 3 need."""
+TABLE_3 = {
+    "ad-hoc": np.array([(0.0, 0, 0.0), (1.820, 22, 2.843), (1.992, 16, 1.974), (1.988, 8, 1.146), (2.0, 2, 0.0)]),
+    "broadcast": np.array([(0.0, 0, 0.0), (1.823, 24, 2.896), (1.991, 18, 1.970), (1.982, 9, 1.154), (2.0, 2, 0.0)]),
+    "cyclic": np.array([(0.0, 0, 0.0), (1.491, 23, 3.432), (1.858, 21, 2.766), (1.943, 11, 1.694), (2.0, 2, 0.0)]),
+}
+"""Mean, maximum and standard deviation at µ = 0, 0.25, 0.5, 0.75, 1: thesis table 3, 3 agents, 1000 runs."""
 
 
 def _shared(scenario: Scenario, data: str) -> np.ndarray:
@@ -124,12 +66,7 @@ def _shared(scenario: Scenario, data: str) -> np.ndarray:
 
 
 def spread(scenario: Scenario, data: str = "own", *, initial_error: bool = True) -> np.ndarray:
-    """E[s sᵀ] over the noise, (noises, noises).
-
-    Parameters
-    ----------
-    initial_error : whether the known initial error is there.
-    """
+    """E[s sᵀ] over the noise, (noises, noises), with the known initial error or without."""
     index = _shared(scenario, data)
     out = (index[:, None] == index[None, :]).astype(float)
     out[-1, -1] = float(initial_error)
@@ -152,26 +89,18 @@ def truth(scenario: Scenario, records: np.ndarray) -> np.ndarray:
     return TRUTH + np.concatenate([np.zeros((len(records), 1)), np.cumsum(moves, axis=1)], axis=1)[:, :steps]
 
 
-LINKS = (0.0, 0.25, 0.5, 0.75, 1.0)
-ARCHITECTURES = ("ad-hoc", "broadcast", "cyclic")
-
-STATED_WINDOW, WINDOW = WINDOWS
-"""Steps over which message loads are averaged: as the thesis says, and as the maxima of its table 3 need."""
-
-
 @dataclass(frozen=True)
 class ThesisCase:
-    """A scenario of the thesis: a preset, with other noises where a figure asks for them.
+    """A scenario of the thesis: a preset, with another process noise where a figure asks for it.
 
     Parameters
     ----------
     name : "transient" or "steady".
-    q, r : variances of process and measurement noise; default: those of the preset.
+    q : variance of the process noise; default: that of the preset.
     """
 
     name: str
     q: float | None = None
-    r: float | None = None
 
 
 TRANSIENT, STEADY = ThesisCase("transient"), ThesisCase("steady")
@@ -206,8 +135,7 @@ class Averages(NamedTuple):
         return self._replace(first=first, second=second)
 
 
-@dataclass(frozen=True, eq=False)
-class Weights:
+class Weights(NamedTuple):
     """Moments of the noise footprint over the outcomes, averaged over the agents.
 
     Parameters
@@ -254,11 +182,8 @@ class Bench:
         return self.known[key]
 
     def scenario(self, case: ThesisCase, architecture: str) -> Scenario:
-        """Return a scenario of the thesis.  P(k0) of the transient one is R, as its table 2 has it."""
-        p0 = case.r if case.name == "transient" else None
-        return load_scenario(
-            f"thesis-{case.name}", architecture=architecture, steps=self.steps, q=case.q, r=case.r, p0=p0
-        )
+        """Return a scenario of the thesis."""
+        return load_scenario(f"thesis-{case.name}", architecture=architecture, steps=self.steps, q=case.q)
 
     def averages(self, case: ThesisCase, architecture: str, rule: str = LFG, *, errors: bool = True) -> list[Averages]:
         """What is averaged over the outcomes, per step; perhaps without footprints, where errors are not wanted."""
@@ -274,10 +199,6 @@ class Bench:
         key = ("averages", case, architecture, rule)
         return self.known.get((*key, True)) or self.once((*key, errors), make)
 
-    def extremes(self, case: ThesisCase, architecture: str, rule: str = LFG) -> np.ndarray:
-        """Smallest and largest covariance claimed in any outcome that links of 0 < µ < 1 allow, (steps, 2)."""
-        return np.array([step.extremes for step in self.averages(case, architecture, rule, errors=False)])
-
     def claimed(
         self, case: ThesisCase, architecture: str, links: Sequence[float] = LINKS, rule: str = LFG
     ) -> np.ndarray:
@@ -289,42 +210,105 @@ class Bench:
 
     def weights(self, case: ThesisCase, architecture: str, links: Sequence[float] = LINKS, rule: str = LFG) -> Weights:
         """Moments of the footprint at some link probabilities."""
-        return self.once(
-            ("weights", case, architecture, tuple(links), rule),
-            lambda: (
-                self._simplified_weights(case, architecture, links)
-                if rule == SIMPLIFIED
-                else self._weights(case, architecture, links, rule)
-            ),
-        )
 
-    def _weights(self, case: ThesisCase, architecture: str, links: Sequence[float], rule: str) -> Weights:
-        found = self.averages(case, architecture, rule)
-        first = np.stack([_at(step.first, links) for step in found], axis=1)
-        return Weights(first, np.stack([_at(step.second, links) for step in found], axis=1))
+        def make() -> Weights:
+            if rule == SIMPLIFIED:
+                x = _simplified_footprint(self.scenario(case, architecture), links)
+                return Weights(x.mean(axis=2), np.einsum("lkai,lkaj->lkij", x, x) / x.shape[2])
+            found = self.averages(case, architecture, rule)
+            first = np.stack([_at(step.first, links) for step in found], axis=1)
+            return Weights(first, np.stack([_at(step.second, links) for step in found], axis=1))
 
-    def _simplified_weights(self, case: ThesisCase, architecture: str, links: Sequence[float]) -> Weights:
-        scenario = self.scenario(case, architecture)
-        x = _simplified_footprint(scenario, links)
-        return Weights(x.mean(axis=2), np.einsum("lkai,lkaj->lkij", x, x) / scenario.network.agents)
+        return self.once(("weights", case, architecture, tuple(links), rule), make)
 
     def sample(self, case: ThesisCase, architecture: str, links: Sequence[float], runs: int) -> np.ndarray:
         """Covariance that agent 1 claims in some sampled runs, (links, runs, steps)."""
-        found = predict(
-            self.scenario(case, architecture), list(links), method=MONTE_CARLO, runs=runs, seed=self.seed
-        ).sampled
+        scenario = self.scenario(case, architecture)
+        found = predict(scenario, list(links), method=MONTE_CARLO, runs=runs, seed=self.seed).sampled
         if found is None:
             raise TypeError("a sample was asked for")
         return found.sample.values.P[found.sample.which[..., 0]][..., 0, 0]
 
-    def messages(self, architecture: str, links: Sequence[float] = LINKS, rule: str = LFG) -> MessageLoad:
-        """Message load at steps 1 to 12."""
+    def messages(self, architecture: str, rule: str = LFG) -> MessageLoad:
+        """Message load at steps 1 to 12, at the thesis' link probabilities."""
+        scenario = load_scenario("thesis-transient", architecture=architecture, steps=WINDOW[1])
+        return self.once(("messages", architecture, rule), lambda: message_load(scenario, list(LINKS), rule))
 
-        def make() -> MessageLoad:
-            scenario = load_scenario("thesis-transient", architecture=architecture, steps=max(*WINDOW, *STATED_WINDOW))
-            return message_load(scenario, list(links), rule)
+    def table_3(self, architecture: str, window: tuple[int, int]) -> np.ndarray:
+        """Exact mean, largest possible value and standard deviation of the message size, laid out as `TABLE_3`."""
+        load = self.messages(architecture).between(*window)
+        return np.stack([load.mean(), load.maximum(), load.std()], axis=1)
 
-        return self.once(("messages", architecture, tuple(links), rule), make)
+
+class Sweep(NamedTuple):
+    """A network of a scenario and what its agents do, over link probabilities: what can be asked about it.
+
+    Parameters
+    ----------
+    bench : has the numbers.
+    case, architecture, rule : scenario, network, and fusion rule or "simplified".
+    links : link probabilities.
+    """
+
+    bench: Bench
+    case: ThesisCase
+    architecture: str = "ad-hoc"
+    rule: str = LFG
+    links: Sequence[float] = LINKS
+
+    def by(self, rule: str) -> Sweep:
+        """Return the same with another rule."""
+        return self._replace(rule=rule)
+
+    @property
+    def network(self) -> str:
+        """The network's name in words."""
+        return self.architecture.replace("-", " ")
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario, with this network."""
+        return self.bench.scenario(self.case, self.architecture)
+
+    @property
+    def claimed(self) -> np.ndarray:
+        """Expected claimed covariance, (links, steps)."""
+        return self.bench.claimed(self.case, self.architecture, self.links, self.rule)
+
+    @property
+    def weights(self) -> Weights:
+        """Moments of the noise footprint."""
+        return self.bench.weights(self.case, self.architecture, self.links, self.rule)
+
+    @property
+    def bias(self) -> np.ndarray:
+        """Mean error, averaged over links and noise, (links, steps)."""
+        return self.weights.first[..., -1]
+
+    def rms(self, data: str = "own", *, initial_error: bool = True) -> np.ndarray:
+        """RMS error, averaged over links and noise, (links, steps)."""
+        return self.weights.rms(spread(self.scenario, data, initial_error=initial_error))
+
+    def averaged(self, data: str = "own", *, initial_error: bool = True) -> np.ndarray:
+        """The same averaged over time, (links,)."""
+        return time_average(self.rms(data, initial_error=initial_error))
+
+    def records(self, number: int, data: str = "own") -> np.ndarray:
+        """Return the first records of truth and measurements, (records, noises)."""
+        return draw(self.scenario, number, self.bench.seed, data)
+
+    def rms_given(self, number: int, data: str = "own") -> np.ndarray:
+        """RMS error for the first records, averaged over links alone as the thesis does, (records, links, steps)."""
+        return self.weights.rms_given(self.records(number, data))
+
+    def size(self, window: tuple[int, int] = WINDOW) -> np.ndarray:
+        """Mean message size in nodes at the thesis' link probabilities, (links,)."""
+        return self.bench.messages(self.architecture, self.rule).between(*window).mean()
+
+
+def time_average(rms: np.ndarray) -> np.ndarray:
+    """RMS errors averaged over the steps but the first, as the thesis averages them; (..., steps) to (...)."""
+    return rms[..., 1:].mean(axis=-1)
 
 
 def _averages(found: Outcomes, step: int) -> Averages:
@@ -355,9 +339,7 @@ def _at(coefficients: np.ndarray, links: Sequence[float]) -> np.ndarray:
 
 
 def _simplified_footprint(scenario: Scenario, links: Sequence[float]) -> np.ndarray:
-    """Footprint of (53), (links, steps, agents, noises), columns as `stochfuse.estimators.world.error_sources` has
-    them.
-    """
+    """Footprint of (53), (links, steps, agents, noises), columns as a record has them."""
     n, steps = scenario.network.agents, scenario.network.steps
     zeros = np.zeros((steps, n, 1))
     one, none = replace(scenario, x0=np.ones((1, 1))), replace(scenario, x0=np.zeros((1, 1)))

@@ -1,42 +1,55 @@
-"""Families of figures: each makes the panels of many figures from the same few numbers.
+"""What the thesis' figures show: quantities, each the panels of a figure from the sweeps that it is about.
 
-Families of figures about messages, and those that compare methods: figures 49–55, 60–62 and 67–72.
+Which figure shows which quantity of what is declared in `stochfuse.thesis.catalogue`.
+
+The thesis' table 3, sizes of Local Fusion Graph messages, stands beside the exact calculation.  The thesis states
+10 steps of which the first five are left out.  Its maxima (24 in a broadcast network, 23 = 2·12 − 1 in a cyclic one)
+need 12 steps, and with steps 6–12 its broadcast column is met within 1 %.  Its *ad hoc* column has the moments of a
+broadcast draw too.  Its cyclic column lies lower than these steps', by 3–6 % in the mean and 5–7 % in the standard
+deviation, which is not explained.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from stochfuse.report.reproductions import DrawnCurve, Panel
 from stochfuse.scenario.registry import LFG, NAIVE, SIMPLIFIED
-from stochfuse.thesis import bench as records
+from stochfuse.scenario.scenario import Scenario
 from stochfuse.thesis.bench import (
-    ARCHITECTURES,
     LINKS,
     STATED_WINDOW,
     STEADY,
+    TABLE_3,
     TRANSIENT,
+    TRUTH,
     WINDOW,
     Bench,
-    ThesisCase,
-    Weights,
+    Sweep,
+    time_average,
+    truth,
 )
 
 FEW = 20
 """Records whose spread is shown."""
+MOST_NODES = 10
+"""Message sizes that the thesis' axes show."""
 RULES = {LFG: "Local Fusion Graph", NAIVE: "naive fusion", SIMPLIFIED: "simplified (53)/(54)"}
-CONNECTIVITY = "average connectivity"
-ONE = "given one record of truth and measurements (seed {}, record 1), averaged over links as the thesis does{}"
 NOISE = "averaged over links and noise, exact"
-APPROXIMATELY = "averaged over links and noise, approximate"
-Make = Callable[[Bench], tuple[Panel, ...]]
+ONE = "given one record of truth and measurements (seed {}, record 1), averaged over links as the thesis does"
+BOTH = "; Local Fusion Graph exact, simplified approximate"
+RATIOS = (("1/16", 6.25), ("1/4", 25.0), ("4", 400.0))
+"""Ratios Q/R; the thesis' own three are not in its text, only 1:4 is."""
+VARIANTS = {
+    "no-error": ("without the common initial error", {"initial_error": False}),
+    "start": ("all agents start from one estimate, fused as if each had its own", {"data": "start"}),
+    "all": ("all agents have one initial estimate and one measurement of each step", {"data": "all"}),
+}
+"""Other readings of what the thesis did, see `stochfuse.thesis.bench`."""
 
-
-def one_record(bench: Bench, *, exact: bool = True) -> str:
-    """Title of what is given one record."""
-    return ONE.format(bench.seed, ", exact" if exact else ", approximate")
+Curves = Sequence[DrawnCurve]
 
 
 def percent(link: float) -> str:
@@ -44,327 +57,266 @@ def percent(link: float) -> str:
     return f"{100 * link:g} %"
 
 
-def over_steps(bench: Bench, title: str, y: str, curves: Sequence[DrawnCurve], y_range=None) -> Panel:
-    """Return curves over the time step."""
-    x = np.arange(1, bench.steps + 1)
-    return Panel(title, "time step", y, tuple(f"k={k}" for k in x), x, tuple(curves), y_range)
-
-
-def over_links(title: str, y: str, curves: Sequence[DrawnCurve], links: Sequence[float] = LINKS) -> Panel:
-    """Return curves over the link probability."""
-    return Panel(title, CONNECTIVITY, y, tuple(map(percent, links)), np.array(links), tuple(curves))
-
-
-def per_link(values: np.ndarray, name: str = "") -> list[DrawnCurve]:
-    """Return a curve over steps per link probability, of values (links, steps)."""
-    return [DrawnCurve(name + percent(link), row) for link, row in zip(LINKS, values, strict=True)]
-
-
-def covariance(case: ThesisCase, architecture: str, rules: Sequence[str] = (LFG,)) -> Make:
-    """Figures 20–22, 36–38, 56, 58, 65, 66: claimed covariance over time, one curve per connectivity."""
-
-    def make(bench: Bench) -> tuple[Panel, ...]:
-        return tuple(
-            over_steps(
-                bench,
-                f"{RULES[rule]}, {'approximate' if rule == SIMPLIFIED else 'exact average over links'}",
-                "claimed covariance",
-                per_link(bench.claimed(case, architecture, rule=rule)),
-            )
-            for rule in rules
-        )
-
-    return make
-
-
-def normalised(case: ThesisCase, architecture: str) -> Make:
-    """Figures 23–25, 39–41: claimed covariance relative to that without links, one curve per step."""
-
-    def make(bench: Bench) -> tuple[Panel, ...]:
-        P = bench.claimed(case, architecture)
-        curves = [DrawnCurve(f"k={k}", column) for k, column in enumerate((P / P[0]).T, start=1)]
-        return (over_links("Local Fusion Graph, exact average over links", "claimed covariance / that at 0 %", curves),)
-
-    return make
-
-
-def states(case: ThesisCase, architecture: str, rules: Sequence[str] = (LFG,)) -> Make:
-    """Figures 26–28, 42–44, 57, 59, 69, 70: mean state estimate over time, with the truth."""
-
-    def make(bench: Bench) -> tuple[Panel, ...]:
-        scenario = bench.scenario(case, architecture)
-        drawn = records.draw(scenario, 1, bench.seed)
-        panels = []
-        for rule in rules:
-            weights = bench.weights(case, architecture, rule=rule)
-            true = records.truth(scenario, drawn)[0]
-            expected = np.full(bench.steps, records.TRUTH)
-            exact = rule != SIMPLIFIED
-            for title, x, error in (
-                (NOISE if exact else APPROXIMATELY, expected, weights.first[..., -1]),
-                (one_record(bench, exact=exact), true, weights.mean_given(drawn)[0]),
-            ):
-                curves = [DrawnCurve("true state", x), *per_link(x + error)]
-                panels.append(over_steps(bench, f"{RULES[rule]}, {title}", "mean state estimate", curves))
-        return tuple(panels)
-
-    return make
-
-
-def errors(case: ThesisCase, architecture: str) -> Make:
-    """Figures 29–31, 45–47: RMS error over time, one curve per connectivity."""
-
-    def make(bench: Bench) -> tuple[Panel, ...]:
-        scenario, weights = bench.scenario(case, architecture), bench.weights(case, architecture)
-        one = weights.rms_given(records.draw(scenario, 1, bench.seed))[0]
-        y = "RMS error (actual)"
-        return (
-            over_steps(bench, f"Local Fusion Graph, {NOISE}", y, per_link(weights.rms(records.spread(scenario)))),
-            over_steps(bench, f"Local Fusion Graph, {one_record(bench)}", y, per_link(one)),
-        )
-
-    return make
-
-
-def time_average(rms: np.ndarray) -> np.ndarray:
-    """RMS errors averaged over the steps but the first, as the thesis averages them; (..., steps) to (...)."""
-    return rms[..., 1:].mean(axis=-1)
-
-
-def averaged_errors(
-    bench: Bench,
-    weights: Weights,
-    case: ThesisCase,
-    architecture: str,
-    data: str = "own",
-    *,
-    initial_error: bool = True,
-) -> np.ndarray:
-    """Return the time-averaged RMS error, averaged over the noise, (links,)."""
-    spread = records.spread(bench.scenario(case, architecture), data, initial_error=initial_error)
-    return time_average(weights.rms(spread))
-
-
-def errors_of_records(
-    bench: Bench, weights: Weights, case: ThesisCase, architecture: str, number: int, data: str = "own"
-) -> np.ndarray:
-    """Return the time-averaged RMS error of single records, (records, links)."""
-    drawn = records.draw(bench.scenario(case, architecture), number, bench.seed, data)
-    return time_average(weights.rms_given(drawn))
-
-
 def change(values: np.ndarray) -> np.ndarray:
     """Change against the first link probability, in per cent of it, along the last axis."""
     return 100.0 * (values / values[..., :1] - 1.0)
 
 
-def averaged_over_time(
-    cases: Sequence[tuple[str, ThesisCase, str]], links: Sequence[float] = LINKS, variants: Sequence[str] = ()
-) -> Make:
-    """Figures 32–35, 48: time-averaged RMS error over connectivity, one curve per (name, case, architecture).
-
-    Parameters
-    ----------
-    variants : further panels: "no initial error", or other records, see `stochfuse.thesis.bench`.
-    """
-
-    def make(bench: Bench) -> tuple[Panel, ...]:
-        found = [(name, case, a, bench.weights(case, a, links)) for name, case, a in cases]
-        y = f"RMS error (actual), mean over steps 2–{bench.steps}"
-        single = [(n, errors_of_records(bench, w, c, a, FEW)) for n, c, a, w in found]
-        panels = [
-            over_links(NOISE, y, [DrawnCurve(n, averaged_errors(bench, w, c, a)) for n, c, a, w in found], links),
-            over_links(one_record(bench), y, [DrawnCurve(n, e[0]) for n, e in single], links),
-            over_links(
-                f"{FEW} single records: median, lowest and highest",
-                "change of that RMS error against 0 %, in per cent of it",
-                [
-                    DrawnCurve(n, np.median(change(e), axis=0), change(e).min(axis=0), change(e).max(axis=0))
-                    for n, e in single
-                ],
-                links,
-            ),
-        ]
-        for variant in variants:
-            title, options = VARIANTS[variant]
-            curves = [DrawnCurve(n, averaged_errors(bench, w, c, a, **options)) for n, c, a, w in found]
-            panels.append(over_links(f"{NOISE}, {title}", y, curves, links))
-        return tuple(panels)
-
-    return make
+def _one_record(bench: Bench, rule: str = LFG) -> str:
+    return ONE.format(bench.seed) + (", approximate" if rule == SIMPLIFIED else ", exact")
 
 
-VARIANTS = {
-    "no-error": ("without the common initial error", {"initial_error": False}),
-    "start": ("all agents start from one estimate, fused as if each had its own", {"data": "start"}),
-    "all": ("all agents have one initial estimate and one measurement of each step", {"data": "all"}),
-}
+def _over_steps(bench: Bench, title: str, y: str, curves: Curves, y_range: tuple[float, float] | None = None) -> Panel:
+    x = np.arange(1, bench.steps + 1)
+    return Panel(title, "time step", y, tuple(f"k={k}" for k in x), x, tuple(curves), y_range)
 
 
-def by_architecture(case: ThesisCase) -> list[tuple[str, ThesisCase, str]]:
-    """Return the three networks of the thesis in one scenario."""
-    return [(a.replace("-", " "), case, a) for a in ARCHITECTURES]
-
-
-RATIOS = (("1/16", 6.25), ("1/4", 25.0), ("4", 400.0))
-"""Ratios Q/R; the thesis' own three are not in its text, only 1:4 is."""
-
-
-def by_ratio(architecture: str) -> list[tuple[str, ThesisCase, str]]:
-    """Return the transient scenario with three ratios of process to measurement noise, R = P(k0) = 100."""
-    return [(f"Q/R = {name}", ThesisCase("transient", q=q), architecture) for name, q in RATIOS]
-
-
-def sample_run(bench: Bench) -> tuple[Panel, ...]:
-    """Figure 19: one run, and what any run can give."""
-    run = bench.sample(TRANSIENT, "ad-hoc", LINKS, 2)[:, 0]
-    return (
-        over_steps(
-            bench, f"one run (seed {bench.seed}, agent 1), sampled", "claimed covariance", per_link(run), (0, 100)
-        ),
+def _over_links(title: str, y: str, curves: Curves, links: Sequence[float] = LINKS, x: str = "", **kind) -> Panel:
+    return Panel(
+        title, x or "average connectivity", y, tuple(map(percent, links)), np.array(links), tuple(curves), **kind
     )
 
 
-MOST_NODES = 10
-"""Message sizes that the thesis' axes show."""
-BOTH_NOISE = "averaged over links and noise; Local Fusion Graph exact, simplified approximate"
-BOTH_ONE = ONE + "; Local Fusion Graph exact, simplified approximate"
+def _per_link(values: np.ndarray) -> list[DrawnCurve]:
+    """Return a curve over steps per link probability, of values (links, steps)."""
+    return [DrawnCurve(percent(link), row) for link, row in zip(LINKS, values, strict=True)]
 
 
-def histogram(architecture: str) -> Make:
-    """Figures 49–51: distribution of the message size."""
-    return _message_distribution(architecture, cumulative=False)
+def sample_run(sweep: Sweep) -> list[Panel]:
+    """One run, and what any run can give."""
+    bench = sweep.bench
+    run = bench.sample(sweep.case, sweep.architecture, LINKS, 2)[:, 0]
+    title = f"one run (seed {bench.seed}, agent 1), sampled"
+    return [_over_steps(bench, title, "claimed covariance", _per_link(run), (0, 100))]
 
 
-def cumulative(architecture: str) -> Make:
-    """Figures 53–55: cumulative distribution of the message size."""
-    return _message_distribution(architecture, cumulative=True)
+def covariance(*sweeps: Sweep) -> list[Panel]:
+    """Claimed covariance over time, one curve per connectivity."""
+    exact = {rule: "approximate" if rule == SIMPLIFIED else "exact average over links" for rule in RULES}
+    return [
+        _over_steps(s.bench, f"{RULES[s.rule]}, {exact[s.rule]}", "claimed covariance", _per_link(s.claimed))
+        for s in sweeps
+    ]
 
 
-def _message_distribution(architecture: str, *, cumulative: bool) -> Make:
-    def make(bench: Bench) -> tuple[Panel, ...]:
-        links = LINKS[1:-1]
-        panels = []
-        for first, last in (WINDOW, STATED_WINDOW):
-            load = bench.messages(architecture, links).between(first, last)
-            values = (load.cdf() if cumulative else load.distribution())[:, : MOST_NODES + 1]
-            x = np.arange(MOST_NODES + 1)
-            title = f"Local Fusion Graph, exact, steps {first}–{last}{_window(first, last)}"
-            y = "cumulative probability" if cumulative else "probability"
-            curves = tuple(DrawnCurve(percent(µ), row) for µ, row in zip(links, values, strict=True))
-            panels.append(
-                Panel(title, "nodes per message", y, tuple(map(str, x)), x, curves, (0.0, 1.0), bars=not cumulative)
-            )
-        return tuple(panels)
+def normalised(sweep: Sweep) -> list[Panel]:
+    """Claimed covariance relative to that without links, one curve per step."""
+    P = sweep.claimed
+    curves = [DrawnCurve(f"k={k}", column) for k, column in enumerate((P / P[0]).T, start=1)]
+    return [_over_links("Local Fusion Graph, exact average over links", "claimed covariance / that at 0 %", curves)]
 
-    return make
+
+def states(*sweeps: Sweep) -> list[Panel]:
+    """Mean state estimate over time, with the truth."""
+    panels = []
+    for s in sweeps:
+        drawn = s.records(1)
+        noise = "averaged over links and noise, approximate" if s.rule == SIMPLIFIED else NOISE
+        for title, x, error in (
+            (noise, np.full(s.bench.steps, TRUTH), s.bias),
+            (_one_record(s.bench, s.rule), truth(s.scenario, drawn)[0], s.weights.mean_given(drawn)[0]),
+        ):
+            curves = [DrawnCurve("true state", x), *_per_link(x + error)]
+            panels.append(_over_steps(s.bench, f"{RULES[s.rule]}, {title}", "mean state estimate", curves))
+    return panels
+
+
+def errors(sweep: Sweep) -> list[Panel]:
+    """RMS error over time, one curve per connectivity."""
+    return [
+        _over_steps(sweep.bench, f"Local Fusion Graph, {title}", "RMS error (actual)", _per_link(rms))
+        for title, rms in ((NOISE, sweep.rms()), (_one_record(sweep.bench), sweep.rms_given(1)[0]))
+    ]
+
+
+def averaged_errors(*sweeps: Sweep, variants: Sequence[str] = ()) -> list[Panel]:
+    """Time-averaged RMS error over connectivity, one curve per network, or ratio of the noises.
+
+    Parameters
+    ----------
+    variants : further panels, of `VARIANTS`.
+    """
+    bench, links = sweeps[0].bench, sweeps[0].links
+    ratio = {q: f"Q/R = {name}" for name, q in RATIOS}
+    names = [s.network if s.case.q is None else ratio[s.case.q] for s in sweeps]
+    y = f"RMS error (actual), mean over steps 2–{bench.steps}"
+
+    def named(values: Sequence[np.ndarray]) -> list[DrawnCurve]:
+        return [DrawnCurve(name, each) for name, each in zip(names, values, strict=True)]
+
+    single = [time_average(s.rms_given(FEW)) for s in sweeps]
+    moves = [change(each) for each in single]
+    return [
+        _over_links(NOISE, y, named([s.averaged() for s in sweeps]), links),
+        _over_links(_one_record(bench), y, named([each[0] for each in single]), links),
+        _over_links(
+            f"{FEW} single records: median, lowest and highest",
+            "change of that RMS error against 0 %, in per cent of it",
+            [
+                DrawnCurve(name, np.median(move, axis=0), move.min(axis=0), move.max(axis=0))
+                for name, move in zip(names, moves, strict=True)
+            ],
+            links,
+        ),
+        *(
+            _over_links(f"{NOISE}, {title}", y, named([s.averaged(**options) for s in sweeps]), links)
+            for title, options in (VARIANTS[variant] for variant in variants)
+        ),
+    ]
+
+
+def histogram(sweep: Sweep, *, cumulative: bool = False) -> list[Panel]:
+    """Distribution of the message size, or the cumulative one."""
+    panels, x = [], np.arange(MOST_NODES + 1)
+    y = "cumulative probability" if cumulative else "probability"
+    for first, last in (WINDOW, STATED_WINDOW):
+        load = sweep.bench.messages(sweep.architecture).between(first, last)
+        values = (load.cdf() if cumulative else load.distribution())[1:-1, : MOST_NODES + 1]
+        curves = tuple(DrawnCurve(percent(µ), row) for µ, row in zip(LINKS[1:-1], values, strict=True))
+        title = f"Local Fusion Graph, {_window(first, last)}"
+        points = tuple(map(str, x))
+        panels.append(Panel(title, "nodes per message", y, points, x, curves, (0.0, 1.0), bars=not cumulative))
+    return panels
+
+
+def cumulative(sweep: Sweep) -> list[Panel]:
+    """Cumulative distribution of the message size."""
+    return histogram(sweep, cumulative=True)
 
 
 def _window(first: int, last: int) -> str:
-    return " (the thesis' stated window)" if (first, last) == STATED_WINDOW else " (what table 3's maxima need)"
+    why = "the thesis' stated window" if (first, last) == STATED_WINDOW else "what table 3's maxima need"
+    return f"exact, steps {first}–{last} ({why})"
 
 
-def mean_size(bench: Bench, architecture: str, rule: str = LFG, window: tuple[int, int] = WINDOW) -> np.ndarray:
-    """Return the mean message size in nodes, (links,)."""
-    return bench.messages(architecture, rule=rule).between(*window).mean()
-
-
-def message_sizes(rules: Sequence[str] = (LFG,)) -> Make:
-    """Figures 52, 60: mean message size over connectivity."""
-
-    def make(bench: Bench) -> tuple[Panel, ...]:
-        names = [(f"{RULES[rule]}, {a.replace('-', ' ')}", a, rule) for rule in rules for a in ARCHITECTURES]
-        panels = []
-        for first, last in (WINDOW, STATED_WINDOW):
-            curves = [DrawnCurve(name, mean_size(bench, a, rule, (first, last))) for name, a, rule in names]
-            panels.append(
-                over_links(f"exact, steps {first}–{last}{_window(first, last)}", "mean message size [nodes]", curves)
-            )
-        return tuple(panels)
-
-    return make
-
-
-def cost_of_accuracy(case: ThesisCase) -> Make:
-    """Figures 61, 62: time-averaged RMS error over the mean message size."""
-
-    def make(bench: Bench) -> tuple[Panel, ...]:
-        found = [(RULES[LFG], a, LFG) for a in ARCHITECTURES] + [(RULES[NAIVE], a, NAIVE) for a in ARCHITECTURES]
-        averaged, single = [], []
-        for name, a, rule in found:
-            weights, size = bench.weights(case, a, rule=rule), mean_size(bench, a, rule)
-            label = f"{name}, {a.replace('-', ' ')}"
-            averaged.append(DrawnCurve(label, averaged_errors(bench, weights, case, a), at=size))
-            single.append(DrawnCurve(label, errors_of_records(bench, weights, case, a, 1)[0], at=size))
-        y = f"RMS error (actual), mean over steps 2–{bench.steps}"
-        return tuple(
-            Panel(title, "mean message size [nodes]", y, tuple(map(percent, LINKS)), np.array(LINKS), tuple(curves))
-            for title, curves in ((NOISE, averaged), (one_record(bench), single))
+def message_sizes(*sweeps: Sweep) -> list[Panel]:
+    """Mean message size over connectivity."""
+    return [
+        _over_links(
+            _window(*window),
+            "mean message size [nodes]",
+            [DrawnCurve(f"{RULES[s.rule]}, {s.network}", s.size(window)) for s in sweeps],
         )
-
-    return make
-
-
-def averaged_covariances(bench: Bench) -> dict[str, np.ndarray]:
-    """Claimed covariance averaged over all steps, per curve of figures 67 and 68, (links,)."""
-    return {
-        f"{RULES[rule]}, {case.name}": bench.claimed(case, "ad-hoc", rule=rule).mean(axis=1)
-        for case in (TRANSIENT, STEADY)
-        for rule in (SIMPLIFIED, LFG)
-    }
+        for window in (WINDOW, STATED_WINDOW)
+    ]
 
 
-def figure_67(bench: Bench) -> tuple[Panel, ...]:
-    """Figure 67: covariance averaged over time, relative to that without links."""
-    curves = [DrawnCurve(name, P / P[0]) for name, P in averaged_covariances(bench).items()]
-    y = f"claimed covariance, mean over steps 1–{bench.steps}, / that at 0 %"
-    panel = over_links("ad hoc; Local Fusion Graph exact, simplified approximate", y, curves)
-    return (Panel(panel.title, panel.x_label, y, panel.points, panel.x, panel.curves, (0.4, 1.0)),)
+def cost_of_accuracy(*sweeps: Sweep) -> list[Panel]:
+    """Time-averaged RMS error over the mean message size."""
+    bench = sweeps[0].bench
+    names, sizes = [f"{RULES[s.rule]}, {s.network}" for s in sweeps], [s.size() for s in sweeps]
+    averaged, single = [s.averaged() for s in sweeps], [time_average(s.rms_given(1))[0] for s in sweeps]
+    y = f"RMS error (actual), mean over steps 2–{bench.steps}"
+    return [
+        _over_links(
+            title,
+            y,
+            [DrawnCurve(name, error, at=at) for name, error, at in zip(names, values, sizes, strict=True)],
+            x="mean message size [nodes]",
+        )
+        for title, values in ((NOISE, averaged), (_one_record(bench), single))
+    ]
 
 
-def figure_68(bench: Bench) -> tuple[Panel, ...]:
-    """Figure 68: difference of the covariances, relative to the initial covariance."""
-    curves = [DrawnCurve(case.name, covariance_difference(bench, case)) for case in (TRANSIENT, STEADY)]
-    y = f"simplified less Local Fusion Graph, mean over steps 1–{bench.steps}, / P(k0)"
-    return (over_links("ad hoc, claimed covariance", y, curves),)
+def averaged_covariances(*sweeps: Sweep) -> list[Panel]:
+    """Covariance averaged over time, relative to that without links."""
+    averages = [(f"{RULES[s.rule]}, {s.case.name}", s.claimed.mean(axis=1)) for s in sweeps]
+    y = f"claimed covariance, mean over steps 1–{sweeps[0].bench.steps}, / that at 0 %"
+    title = "ad hoc; Local Fusion Graph exact, simplified approximate"
+    return [_over_links(title, y, [DrawnCurve(name, P / P[0]) for name, P in averages], y_range=(0.4, 1.0))]
 
 
-def covariance_difference(bench: Bench, case: ThesisCase) -> np.ndarray:
+def covariance_differences(*sweeps: Sweep) -> list[Panel]:
+    """Difference of the covariances of the two methods, relative to the initial covariance."""
+    curves = [DrawnCurve(s.case.name, covariance_difference(s)) for s in sweeps]
+    y = f"simplified less Local Fusion Graph, mean over steps 1–{sweeps[0].bench.steps}, / P(k0)"
+    return [_over_links("ad hoc, claimed covariance", y, curves)]
+
+
+def covariance_difference(sweep: Sweep) -> np.ndarray:
     """Simplified less exact claimed covariance, averaged over time, in units of P(k0), (links,)."""
-    found = averaged_covariances(bench)
-    difference = found[f"{RULES[SIMPLIFIED]}, {case.name}"] - found[f"{RULES[LFG]}, {case.name}"]
-    return difference / bench.scenario(case, "ad-hoc").P0.item()
+    simplified, exact = (sweep.by(rule).claimed.mean(axis=1) for rule in (SIMPLIFIED, LFG))
+    return (simplified - exact) / sweep.scenario.P0.item()
 
 
-def relative_errors(bench: Bench, *, one_record: bool) -> dict[tuple[str, str], np.ndarray]:
-    """Time-averaged RMS error relative to that without links, per (case, rule), (links,)."""
-    out = {}
-    for case in (TRANSIENT, STEADY):
-        for rule in (SIMPLIFIED, LFG):
-            weights = bench.weights(case, "ad-hoc", rule=rule)
-            if one_record:
-                rms = errors_of_records(bench, weights, case, "ad-hoc", 1)[0]
-            else:
-                rms = averaged_errors(bench, weights, case, "ad-hoc")
-            out[case.name, rule] = rms / rms[0]
-    return out
+def relative_error(sweep: Sweep, *, one_record: bool = False) -> np.ndarray:
+    """Time-averaged RMS error relative to that without links, (links,)."""
+    rms = time_average(sweep.rms_given(1))[0] if one_record else sweep.averaged()
+    return rms / rms[0]
 
 
-def figure_71(bench: Bench) -> tuple[Panel, ...]:
-    """Figure 71: relative RMS errors of both methods."""
+def relative_errors(*sweeps: Sweep) -> list[Panel]:
+    """Relative RMS errors of both methods."""
+    bench = sweeps[0].bench
+    return [
+        _over_links(
+            title,
+            f"RMS error, mean over steps 2–{bench.steps}, / 0 %",
+            [DrawnCurve(f"{RULES[s.rule]}, {s.case.name}", relative_error(s, one_record=one)) for s in sweeps],
+        )
+        for title, one in _both(bench)
+    ]
+
+
+def error_differences(*sweeps: Sweep) -> list[Panel]:
+    """Difference of the relative RMS errors of the two methods."""
+
+    def difference(s: Sweep, one: bool) -> np.ndarray:
+        return relative_error(s.by(SIMPLIFIED), one_record=one) - relative_error(s.by(LFG), one_record=one)
+
+    return [
+        _over_links(
+            title,
+            "simplified less Local Fusion Graph, both / 0 %",
+            [DrawnCurve(s.case.name, difference(s, one)) for s in sweeps],
+        )
+        for title, one in _both(sweeps[0].bench)
+    ]
+
+
+def _both(bench: Bench) -> tuple[tuple[str, bool], ...]:
+    return (f"ad hoc, averaged over links and noise{BOTH}", False), (f"ad hoc, {ONE.format(bench.seed)}{BOTH}", True)
+
+
+def table_3(*sweeps: Sweep) -> list[Panel]:
+    """Table 3 beside the exact calculation, for the window it needs and the one it states; a panel per column."""
     panels = []
-    for title, one in ((BOTH_NOISE, False), (BOTH_ONE.format(bench.seed, ""), True)):
-        found = relative_errors(bench, one_record=one)
-        curves = [DrawnCurve(f"{RULES[rule]}, {case}", y) for (case, rule), y in found.items()]
-        panels.append(over_links(f"ad hoc, {title}", f"RMS error, mean over steps 2–{bench.steps}, / 0 %", curves))
-    return tuple(panels)
+    for s in sweeps:
+        draws = ("ad-hoc", "broadcast") if s.architecture == "ad-hoc" else (s.architecture,)
+        known = {"thesis": TABLE_3[s.architecture]} | {
+            f"{draw.replace('-', ' ')}, k={first}–{last}": s.bench.table_3(draw, (first, last))
+            for draw in draws
+            for first, last in (STATED_WINDOW, WINDOW)
+        }
+        curves = [
+            DrawnCurve(f"{moment}, {name}", table[:, column])
+            for column, moment in enumerate(("mean", "maximum", "std"))
+            for name, table in known.items()
+        ]
+        title = f"the thesis' column '{s.network}', and exact values by draw and window"
+        panels.append(_over_links(title, "message size [nodes]", curves))
+    return panels
 
 
-def figure_72(bench: Bench) -> tuple[Panel, ...]:
-    """Figure 72: their difference."""
-    panels = []
-    for title, one in ((BOTH_NOISE, False), (BOTH_ONE.format(bench.seed, ""), True)):
-        found = relative_errors(bench, one_record=one)
-        curves = [DrawnCurve(c.name, found[c.name, SIMPLIFIED] - found[c.name, LFG]) for c in (TRANSIENT, STEADY)]
-        panels.append(over_links(f"ad hoc, {title}", "simplified less Local Fusion Graph, both / 0 %", curves))
-    return tuple(panels)
+def parameters(bench: Bench) -> list[tuple[str, str, str]]:
+    """Parameters in the thesis' tables 2 and 4 beside the presets'."""
+    transient, steady = (Sweep(bench, case).scenario for case in (TRANSIENT, STEADY))
+    model, sensor, network = transient.model, transient.sensors[0], transient.network
+    return [
+        ("F, H", "1", f"{model.F.item():g}, {sensor.H.item():g}"),
+        ("B, G", "1 (u = 0)", "none: no input; Q acts on the state"),
+        ("Q", "25", f"{model.Q.item():g}"),
+        ("R", "100", f"{sensor.R.item():g}"),
+        ("x(0)", "1000 + N(0, Q)", "1000 at step 1; its scatter of 5 is left out"),
+        ("agents", "3", f"{network.agents}"),
+        ("steps", "1 to 5", f"1 to {network.steps}"),
+        ("delay", "0", "0"),
+        ("link probabilities", "0, 0.25, 0.5, 0.75, 1", ", ".join(f"{link:g}" for link in LINKS)),
+        ("transient: P(k0), estimate", "R, drawn from N(0, R)", _start(transient)),
+        ("steady: P(k0), estimate", "45, drawn from x(0) + N(0, 45)", _start(steady)),
+    ]
+
+
+def _start(scenario: Scenario) -> str:
+    error = 0.0 if scenario.error is None else scenario.error.item()
+    return f"{scenario.P0.item():g}, truth {error:+g} + N(0, {scenario.P0.item():g}), each agent its own"

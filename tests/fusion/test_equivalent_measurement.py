@@ -14,7 +14,6 @@ from stochfuse.fusion.equivalent import (
     actual_error,
     equivalent_measurement,
     independent_measurement,
-    worst_error,
 )
 from stochfuse.fusion.extended import NonlinearModel, extended_filter, extended_step, jacobian
 from stochfuse.kalman.kernel import Estimate
@@ -103,6 +102,19 @@ def test_at_their_own_epsilon_single_bounds_need_not_exceed_the_fused_one_in_the
     got = equivalent_measurement(np.diag([1e-9, 1e-9, 1e3, 1.0]), 2, np.diag([1.0, 100.0, 1e3, 1e-9]))
     assert all(got.R.trace() < alone.trace() for alone in got.single)
     assert np.linalg.eigvalsh(got.single[0] - got.R).min() < -0.9
+
+
+def worst_error(A, R, D):
+    """Error covariance of A(v + δ) for the correlation of δ with v that makes its trace largest, E[δδᵀ] = D.
+
+    With A R Aᵀ = L Lᵀ, A D Aᵀ = M Mᵀ and LᵀM = U Σ Vᵀ: of L w + M V Uᵀ w with white w, trace tr A(R + D)Aᵀ + 2 tr Σ.
+    """
+    # the square root of a zero's rounding would be no rounding
+    roots = (U * np.sqrt(np.where(values > 1e-14 * values.max(), values, 0.0)) for values, U in map(np.linalg.eigh, (R, D)))
+    L, M = (A @ root for root in roots)
+    U, _, Vt = np.linalg.svd(L.T @ M)
+    together = L + M @ Vt.T @ U.T
+    return together @ together.T
 
 
 @given(seeds, st.integers(1, 3), st.integers(1, 3))

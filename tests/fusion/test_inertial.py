@@ -18,7 +18,6 @@ import stochfuse
 from stochfuse.errors import UsageError
 from stochfuse.fusion.inertial import (
     STATES,
-    TACTICAL,
     UNITS,
     ImuGrade,
     InitialErrors,
@@ -38,6 +37,10 @@ from tests.oracles.strategies import seeds
 OMEGA, A, E2 = 7.292115e-5, 6378137.0, 6.69437999014e-3
 PRESET = next((Path(stochfuse.__file__).parent / "scenario" / "presets").glob("gps-ins.toml*"))
 LEGS = [Leg(5, 1.0), Leg(10, 0, np.deg2rad(4)), Leg(10, -0.5, np.deg2rad(-3), 6), Leg(10, 1.0, 0.0, -2)]
+# Honeywell HG1700, see the preset gps-ins; in-run instability a tenth of the turn-on bias, over an hour
+TACTICAL = ImuGrade.from_data_sheet(
+    angle_random_walk=0.125, velocity_random_walk=0.0198, gyro=(1.0, 0.1, 3600.0), accelerometer=(1.0, 0.1, 3600.0)
+)
 NO_BIAS_DECAY = ImuGrade(0, 0, 0, 0, np.inf, 0, 0, np.inf)
 SMALL = InitialErrors(np.full(3, 1e-3), np.full(3, 0.1), np.full(3, 3.0))
 

@@ -18,11 +18,10 @@ from stochfuse.errors import UsageError
 from stochfuse.report import plot
 from stochfuse.report import reproductions as report
 from stochfuse.scenario.registry import LFG, NAIVE, SIMPLIFIED
-from stochfuse.thesis import Bench, about_covariance, about_errors, about_records, catalogue, find, sheet
+from stochfuse.thesis import Bench, about_covariance, about_records, catalogue, find, sheet
 from stochfuse.thesis import bench as records
-from stochfuse.thesis.bench import ARCHITECTURES, LINKS, STEADY, TRANSIENT, ThesisCase
+from stochfuse.thesis.bench import ARCHITECTURES, LINKS, STEADY, TRANSIENT, Sweep, ThesisCase, time_average
 from stochfuse.thesis.catalogue import NOT_COVERED, statements
-from stochfuse.thesis.figures import time_average
 from stochfuse.thesis.statements import explained, judged
 from tests.cli.command import run, strict_json
 from tests.oracles import textbook
@@ -243,7 +242,8 @@ def test_known_algorithms_are_the_textbooks(bench):
 def test_the_initial_error_explains_figures_32_and_33(bench):
     """Theory section 7: peaks near 12.5 % for broadcast and 25 % for cyclic; without initial error it falls."""
     fine = (0.0, 0.125, 0.25, 0.375, 0.5)
-    broadcast, cyclic = (about_errors.averaged(bench, a, fine) for a in ("broadcast", "cyclic"))
+    sweeps = {a: Sweep(bench, TRANSIENT, a, links=fine) for a in ("broadcast", "cyclic")}
+    broadcast, cyclic = (sweep.averaged() for sweep in sweeps.values())
     assert fine[broadcast.argmax()] == 0.125
     assert fine[cyclic.argmax()] == 0.25
     assert cyclic[4] > cyclic[0]
@@ -251,22 +251,20 @@ def test_the_initial_error_explains_figures_32_and_33(bench):
         bias = np.abs(bench.weights(TRANSIENT, a, fine).first[..., -1])[:, 1:].mean(axis=1)
         assert bias.argmax() == peak
         assert (bias[4] > bias[0]) == (a == "cyclic")
-    for a in ("broadcast", "cyclic"):
-        assert (np.diff(about_errors.averaged(bench, a, fine, initial_error=False)) < 0).all()
+    for sweep in sweeps.values():
+        assert (np.diff(sweep.averaged(initial_error=False)) < 0).all()
 
 
 def test_process_noise_shrinks_the_rise(bench):
     """Theory section 7: the bias alone gives a rise at Q/R = 1/4 and 1/16 and none at 4 (at the thesis' levels)."""
-    rises = [
-        about_errors.averaged(bench, "broadcast", LINKS, ThesisCase("transient", q=q)) for q in (6.25, 25.0, 400.0)
-    ]
+    rises = [Sweep(bench, ThesisCase("transient", q=q), "broadcast").averaged() for q in (6.25, 25.0, 400.0)]
     assert [r[1] > r[0] for r in rises] == [True, True, False]
 
 
 def test_single_steady_records_seldom_rise_unless_data_are_shared(bench):
     seen = {}
     for data in records.DATA:
-        found = time_average(about_records.given(bench, "broadcast", data))
+        found = time_average(about_records.given(Sweep(bench, STEADY, "broadcast"), data))
         seen[data] = np.mean(found[:, 1] > found[:, 0])
     # binomial standard errors of 2000 records are 0.004 and 0.009
     assert seen["own"] < 0.05
