@@ -22,6 +22,7 @@ import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, wraps
+from numbers import Real
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
@@ -444,22 +445,24 @@ def _override_noise(mapping: dict[str, Any], entry: str, value: Any) -> None:
     Raises
     ------
     UsageError
-        If only agents' own sensors have an R.
+        If only agents' own sensors have an R, or if what is to have a root is no number.
     """
     model = mapping["model"]
     if entry == "Q" and model.get("kind") is not None:
-        model["noise"] = _root(value) if model.get("noise_kind") == "piecewise" else value
+        model["noise"] = _root("q", value) if model.get("noise_kind") == "piecewise" else value
     elif entry == "R" and is_named(model.get("sensor")):
-        model["sensor"] = {**model["sensor"], "sigma": _root(value)}
+        model["sensor"] = {**model["sensor"], "sigma": _root("r", value)}
     elif entry == "R" and "H" not in model and "agent" in mapping and "navigation" not in mapping:
         raise UsageError("r: expected a sensor of the model (model.R or model.sensor), got agents with their own alone")
     else:
         model[entry] = value
 
 
-def _root(variance: Any) -> Any:
-    """Standard deviation of a variance; what is none is left for the reading to refuse."""
-    return variance**0.5 if isinstance(variance, int | float) and variance >= 0 else variance
+def _root(key: str, variance: Any) -> Any:
+    """Standard deviation of a variance; a negative one is left for the reading to refuse."""
+    if not isinstance(variance, Real):
+        raise UsageError(f"{key}: expected a variance, in the place of a standard deviation, got {shown(variance)}")
+    return float(variance) ** 0.5 if variance >= 0 else variance
 
 
 def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> Scenario:

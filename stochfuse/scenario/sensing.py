@@ -43,6 +43,8 @@ NEAREST = 1e-30
 SMALLEST = 1e-50
 """Smallest standard deviation: its square is a number still."""
 FULL_TURN = 2.0 * np.pi
+MOST_STEPS = 100_000
+"""Most steps of a network with sensors by name: each has matrices of its own for every step."""
 
 
 class Sight(NamedTuple):
@@ -400,6 +402,9 @@ def read_named(
     named = [i for i, agent in enumerate(tables) if is_named(agent.get("sensor"))]
     if model is None or network is None or not (common or named or table.get("nominal")):
         return Named(dict.fromkeys(named))
+    if network.steps > MOST_STEPS:
+        check.note("network.steps", f"at most {MOST_STEPS} with sensors by name or a nominal path", str(network.steps))
+        return Named(dict.fromkeys([0, *named]))
     layout, steps = layout_of(table.get("kind"), model.states), network.steps
     course = read_course(check, table, layout, model, steps)
     given = _Given(layout, course, model, steps, table.get("nominal") is not None, own)
@@ -458,8 +463,9 @@ def _read(check: Checker, path: str, table: Mapping[str, Any], given: _Given) ->
         check, f"{path}.field_of_view", table.get("field_of_view"), "a full width in rad above 0, at most 2π", FULL_TURN
     )
     heading = _heading(check, path, table, given.steps)
-    if table.get("field_of_view") is not None and layout.axes < 2:
+    if np.isfinite(width) and layout.axes < 2:
         check.note(f"{path}.field_of_view", "nothing on a line, which has no bearings", shown(table["field_of_view"]))
+        return None
     if R is None or due is None or heading is None:
         return None
     read = _Read(path, kind, layout, R, due, reach, width, heading, detection)

@@ -565,12 +565,38 @@ def test_a_place_that_only_matters_before_it_measures():
     assert seen(scenario({"period": 2}, agent__0__position=[-270, 397.5])) == [3, 5]
 
 
+def test_a_line_has_no_bearings():
+    mapping = scenario(model__axes=1, model__nominal={"position": 5.0, "velocity": 1.0}, initial__P=1.0)
+    mapping["agent"] = [
+        {"position": 0.0, "sensor": {"kind": "range", "sigma": 1.0}},
+        {"position": [[9.0]] * STEPS, "sensor": {"kind": "range-rate", "sigma": 1.0}},
+    ]
+    s = sf.load_scenario(mapping)
+    assert s.sensors[0].H.tolist() == [[1.0, 0.0]]
+    assert s.sensors[1].H.tolist() == [[0.0, -1.0]]
+    mapping["agent"][0]["sensor"]["field_of_view"] = 1.0
+    with pytest.raises(
+        sf.ScenarioError, match=r"field_of_view: expected nothing on a line, which has no bearings, got 1.0"
+    ):
+        sf.load_scenario(mapping)
+
+
+def test_steps_have_an_end():
+    with pytest.raises(sf.ScenarioError, match=r"network.steps: expected at most 100000 with sensors by name"):
+        sf.load_scenario(scenario(network__steps=10_000_000))
+
+
 def test_variances_from_the_command_line():
     mapping = scenario(model__nominal=None)
     del mapping["agent"]
     mapping["model"]["sensor"] = {"kind": "position", "sigma": 5.0}
     assert sf.load_scenario(mapping, r=9.0).sensors[0].R.tolist() == [[9, 0], [0, 9]]
+    assert sf.load_scenario(mapping, r=np.int64(9)).sensors[0].R.tolist() == [[9, 0], [0, 9]]
     assert mapping["model"]["sensor"]["sigma"] == 5.0
+    with pytest.raises(
+        sf.UsageError, match=r"r: expected a variance, in the place of a standard deviation, got \[4, 9\]"
+    ):
+        sf.load_scenario(mapping, r=[4, 9])
     with pytest.raises(sf.ScenarioError, match=r"model.sensor.sigma: expected a standard deviation above 0 in m"):
         sf.load_scenario(mapping, r=-9.0)
     with pytest.raises(
