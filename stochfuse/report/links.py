@@ -13,6 +13,8 @@ from stochfuse.report.table import Report, Table, to_csv
 from stochfuse.scenario.links import MEMORY, Links
 
 SCHEMA = "stochfuse.links/1"
+NAMES = ("receiver", "sender")
+"""Axes of what is known of links, and the columns that name a link."""
 
 
 def links_report(found: Links) -> Report:
@@ -46,7 +48,7 @@ def links_table(found: Links) -> list[Table]:
     tables = [Table(head, ("receiver",), across, tuple(matrix))]
     if found.sent is not None:
         title = ("Each link: Jeffreys interval; Δ back: less the link the other way; memory by likelihood ratio",)
-        tables.append(Table(title, ("receiver", "sender"), columns, tuple(rows)))
+        tables.append(Table(title, NAMES, columns, tuple(rows)))
     if found.delay is not None:
         delays = tuple((str(k), f"{p:.4f}") for k, p in enumerate(found.delay))
         tables.append(Table(("Delay of messages that arrive",), ("steps",), ("probability",), delays))
@@ -80,7 +82,17 @@ def links_csv(found: Links) -> str:
             ends = (float(found.low[i, j]), float(found.high[i, j])) if known else ("", "")
             counts = ("", "") if found.sent is None else (int(found.sent[i, j]), int(found.received[i, j]))  # type: ignore[index]
             rows.append((receiver, sender, float(found.link[i, j]), *ends, *counts))
-    return to_csv(("receiver", "sender", "link", "low", "high", "sent", "received"), rows)
+    return to_csv((*NAMES, "link", "low", "high", "sent", "received"), rows)
+
+
+def arrays(found: Links) -> dict[str, Any]:
+    """Return what an xarray.Dataset takes: (receiver, sender) arrays of all that is known, NaN where nothing is."""
+    known = {name: getattr(found, name) for name in ("link", "low", "high", "sent", "received", "memory")}
+    return {
+        "data_vars": {name: (NAMES, M) for name, M in known.items() if M is not None},
+        "coords": {name: list(found.nodes) for name in NAMES},
+        "attrs": {"source": found.source, "kind": found.kind},
+    }
 
 
 def links_json(found: Links) -> dict[str, Any]:
@@ -112,22 +124,19 @@ def _listed(M: np.ndarray) -> list[list[float | None]]:
 
 def network_table(found: Links) -> str:
     """Return the [network] table of a scenario; links of which nothing is known are not heard."""
-    n = len(found.nodes)
-    known = ~np.isnan(found.link)
     rows = ",\n".join("  [" + ", ".join(f"{0.0 if np.isnan(x) else x:.6g}" for x in row) + "]" for row in found.link)
     lines = [
         f"# Links of {found.source} ({found.kind}), receiver × sender",
         "[network]",
-        f"agents = {n}",
+        f"agents = {len(found.nodes)}",
         "steps = 10",
         f"nodes = {json.dumps(list(found.nodes), ensure_ascii=False)}",
         f"link = [\n{rows},\n]",
     ]
     if found.unknown:
-        hears = [[j + 1 for j in range(n) if known[i, j]] for i in range(n)]
-        lines += ["# nothing is known of the other links: they are taken for none", f"hears = {hears}"]
+        lines += ["# nothing is known of the other links: they are taken for none", f"hears = {found.hears}"]
     if found.delay is not None:
-        lines.append(f"delay = {[round(p, 6) for p in found.delay]}")
+        lines.append(f"delay = {list(found.delay)}")
     return "\n".join(lines) + "\n"
 
 
