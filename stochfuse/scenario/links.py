@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse.errors import Problem, ScenarioError, StochfuseError, UsageError, nearest
+from stochfuse.errors import Problem, ScenarioError, UsageError, nearest, needed
 from stochfuse.scenario.result import Result
 
 CONFIDENCE = 0.95
@@ -179,25 +179,30 @@ def _frame_matrix(frame: Any) -> Links:
     return _matrix("table", names, names, cells)
 
 
-def as_network(found: Links, network: Mapping[str, Any], name: str, key: str = "network.link") -> dict[str, Any]:
+def as_network(
+    found: Links, network: Mapping[str, Any], name: str, key: str = "network.link", *, silent: bool = False
+) -> dict[str, Any]:
     """Return a scenario's [network] with links that are known in the place of what names them.
 
     Parameters
     ----------
     network : its other keys; `nodes` picks some of the nodes, in that order, `hears` says which links there are.
     name, key : the scenario's name and the key that holds the links, for messages.
+    silent : whether nothing is heard on links that are unknown, where `hears` is not given.
 
     Raises
     ------
     ScenarioError
         If they do not fit the agents, or leave a link unknown that may be heard.
     """
-    nodes, agents, hears = (network.get(known) for known in ("nodes", "agents", "hears"))
+    nodes, agents = network.get("nodes"), network.get("agents")
     try:
         found = found.of([str(node) for node in nodes]) if isinstance(nodes, list) else found
     except UsageError as error:
         raise ScenarioError(name, [Problem(key, "links of network.nodes", f"({error})")]) from None
-    n, link = len(found.nodes), found.link.copy()
+    if silent and found.unknown and "hears" not in network:
+        network = {**network, "hears": found.hears}
+    n, link, hears = len(found.nodes), found.link.copy(), network.get("hears")
     if agents is not None and agents != n:
         raise ScenarioError(name, [Problem("network.agents", f"{n}, the nodes of {found.source}", str(agents))])
     for i, j in np.argwhere(np.isnan(link)).tolist():
@@ -801,9 +806,4 @@ def _delays(source: str, table: Mapping[str, Any], step: float | None) -> tuple[
 
 
 def _arrow(name: str) -> Any:
-    from importlib import import_module
-
-    try:
-        return import_module(name)
-    except ImportError:
-        raise StochfuseError("files of links need pyarrow: pip install 'stochfuse[study]'") from None
+    return needed(name, "study", "files of links need")
