@@ -187,20 +187,10 @@ def _links_of_edges(
         found["hears"] = [[j + 1 for j in range(n) if (i, j) in delays] for i in range(n)]
     late = list(delays.values())
     if any(other != late[0] for other in late):
-        found["delay"] = _delay_matrix(n, delays)
+        found["delay"] = [[delays.get((i, j), 0) for j in range(n)] for i in range(n)]
     elif late and late[0] != 0:
         found["delay"] = late[0]
     return found
-
-
-def _delay_matrix(n: int, delays: Mapping[Edge, Any]) -> list[list[Any]]:
-    """(receiver, sender) steps; of any edge that has a distribution distributions, all of one length."""
-    steps = [[delays.get((i, j), 0) for j in range(n)] for i in range(n)]
-    if all(_is_count(late) for row in steps for late in row):
-        return steps
-    spread = [[[0.0] * int(d) + [1.0] if _is_count(d) else list(d) for d in row] for row in steps]
-    longest = max(len(d) for row in spread for d in row)
-    return [[d + [0.0] * (longest - len(d)) for d in row] for row in spread]
 
 
 def from_stonesoup(
