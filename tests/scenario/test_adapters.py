@@ -135,6 +135,9 @@ def test_links_of_a_log_are_taken_with_their_names_and_what_is_unknown_is_not_he
         np.testing.assert_allclose(
             values(s), values({**FILE, "network": {"agents": 3, "steps": 3, "link": by_hand}}), rtol=1e-12
         )
+    p = sf.predict(sf.scenario(MODEL, network={"steps": 3, "link": found}, initial=P0), interval=0.95)
+    assert (p.low() < p.values()).all()
+    assert (p.values() < p.high()).all()
     two = sf.scenario(MODEL, network={"steps": 3, "link": found, "nodes": ["b", "a"]}, initial=P0)
     assert two.network.agents == 2
     assert two.network.hears is None
@@ -455,6 +458,8 @@ def test_an_architecture_is_late_by_the_steps_that_stone_soup_simulates(soup):
     assert len({(receiver, sender) for receiver, sender, _ in simulated}) == len(LATENCIES)
     for (receiver, sender, _), late in simulated.items():
         assert network["delay"]["abc".index(receiver)]["abc".index(sender)] == late
+    made = sf.scenario(**tables, initial=np.diag([100.0, 1.0, 100.0, 1.0])).network
+    assert made.delay_of(1, 2).index(1.0) == 3  # b from c, 2.2 s
 
 
 def test_equal_latencies_are_one_delay_that_can_be_predicted(soup):
