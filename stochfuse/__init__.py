@@ -46,6 +46,9 @@ if TYPE_CHECKING:
     from stochfuse.questions.sensitivity import Sensitivity as Sensitivity
     from stochfuse.questions.sensitivity import sensitivity as sensitivity
     from stochfuse.questions.sensitivity import share_of_gain as share_of_gain
+    from stochfuse.scenario import Room
+    from stochfuse.scenario.adapters import from_networkx as from_networkx
+    from stochfuse.scenario.adapters import from_stonesoup as from_stonesoup
     from stochfuse.scenario.known_links import links as links
     from stochfuse.scenario.scenario import Scenario as Scenario
     from stochfuse.scenario.scenario import load_scenario as load_scenario
@@ -53,6 +56,8 @@ if TYPE_CHECKING:
     from stochfuse.symbolic.general import derive_general as derive_general
     from stochfuse.symbolic.optimal import derive_optimal as derive_optimal
     from stochfuse.symbolic.simplified import derive_simplified as derive_simplified
+
+    scenario: Room
 
 _HOME = {
     "AgentsNeeded": "questions.agents_needed",
@@ -76,6 +81,8 @@ _HOME = {
     "derive_general": "symbolic.general",
     "derive_optimal": "symbolic.optimal",
     "derive_simplified": "symbolic.simplified",
+    "from_networkx": "scenario.adapters",
+    "from_stonesoup": "scenario.adapters",
     "least_link": "questions.least_link",
     "links": "scenario.known_links",
     "load_history": "estimators.fusion_graph",
@@ -114,6 +121,8 @@ __all__ = [
     "derive_general",
     "derive_optimal",
     "derive_simplified",
+    "from_networkx",
+    "from_stonesoup",
     "least_link",
     "links",
     "load_history",
@@ -123,6 +132,7 @@ __all__ = [
     "predict_many",
     "predict_states",
     "read_results",
+    "scenario",
     "sensitivity",
     "share_of_gain",
     "steady_state",
@@ -131,7 +141,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name in ("fusion", "kalman", "thesis"):
+    if name in ("fusion", "kalman", "scenario", "thesis"):
         return import_module(f"stochfuse.{name}")
     if name not in _HOME:
         raise AttributeError(f"module 'stochfuse' has no attribute '{name}'")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from importlib import import_module
+from types import ModuleType
 from typing import NamedTuple
 
 
@@ -64,3 +66,23 @@ class NoAnswerError(StochfuseError):
     def __init__(self, message: str = "", items: Iterable[int] = ()):
         self.items = tuple(items)
         super().__init__(message)
+
+
+def needed(module: str, extra: str, what: str = "this needs") -> ModuleType:
+    """Return a module that not everybody has.
+
+    Parameters
+    ----------
+    extra : what of stochfuse's extras brings it.
+    what : the beginning of the message.
+
+    Raises
+    ------
+    StochfuseError
+        If it is not installed; with the line that installs it.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        missing = (error.name or module).partition(".")[0]
+        raise StochfuseError(f"{what} {missing}: pip install 'stochfuse[{extra}]'") from None

@@ -14,8 +14,9 @@ from stochfuse.errors import NoAnswerError, TooManyError, UsageError
 from stochfuse.kalman.metrics import Metric
 from stochfuse.prediction.predict import choose, predict
 from stochfuse.prediction.quantities import QUANTITIES
-from stochfuse.prediction.result import Prediction, Result
+from stochfuse.prediction.result import Prediction
 from stochfuse.scenario.registry import CHAIN, ESTIMATORS, GENERAL, METHODS, MONTE_CARLO, NAIVE, OPTIMAL, SIMPLIFIED
+from stochfuse.scenario.result import Result
 from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario
 
 DEFAULT_METHODS = (GENERAL, SIMPLIFIED, NAIVE, MONTE_CARLO)

@@ -21,7 +21,7 @@ from stochfuse.errors import StochfuseError, TooManyError, UsageError, nearest
 from stochfuse.kalman.checks import covariance_fault
 from stochfuse.prediction.method import RUNS, Averaged, Settings, faults_of
 from stochfuse.prediction.quantities import QUANTITIES
-from stochfuse.prediction.result import Prediction, Result
+from stochfuse.prediction.result import Prediction
 from stochfuse.scenario import capabilities, registry
 from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.registry import (
@@ -36,6 +36,7 @@ from stochfuse.scenario.registry import (
     OPTIMAL,
     SIMPLIFIED,
 )
+from stochfuse.scenario.result import Result
 from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario
 from stochfuse.scenario.system import Items, Noises, System
 

@@ -35,9 +35,9 @@ from stochfuse.kalman.kernel import (
 from stochfuse.kalman.metrics import Moments
 from stochfuse.prediction import simplified
 from stochfuse.prediction.method import Averaged
-from stochfuse.prediction.result import brief
 from stochfuse.scenario.model import Sensor
 from stochfuse.scenario.network import LinkRows
+from stochfuse.scenario.result import brief
 from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario
 from stochfuse.scenario.system import Items, System
 

@@ -28,9 +28,9 @@ from stochfuse.errors import NoAnswerError, UsageError
 from stochfuse.kalman.averaged_update import basis, triangle
 from stochfuse.prediction import simplified
 from stochfuse.prediction.boundedness import decide, growing, growing_mode, hidden_mode, recursions
-from stochfuse.prediction.result import brief
 from stochfuse.scenario.model import Model, Sensor
 from stochfuse.scenario.network import LinkRows
+from stochfuse.scenario.result import brief
 from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario
 from stochfuse.scenario.system import Items
 

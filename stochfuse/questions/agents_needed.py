@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from stochfuse.errors import NoAnswerError, UsageError
-from stochfuse.prediction.result import Prediction, Result
+from stochfuse.prediction.result import Prediction
 from stochfuse.questions.question import (
     SLACK,
     Question,
@@ -26,6 +26,7 @@ from stochfuse.questions.question import (
     require_like_links,
 )
 from stochfuse.scenario.registry import OPTIMAL, SIMPLIFIED
+from stochfuse.scenario.result import Result
 from stochfuse.scenario.scenario import Scenario, of_scenario
 
 MOST_AGENTS = {SIMPLIFIED: 1_000_000, OPTIMAL: 100}

@@ -36,8 +36,9 @@ from scipy.special import chdtrc, fdtrc, stdtr
 from stochfuse.engines.distribution import Distribution
 from stochfuse.errors import UsageError
 from stochfuse.kalman.metrics import Metric
-from stochfuse.prediction.result import Prediction, brief
+from stochfuse.prediction.result import Prediction
 from stochfuse.questions.results import ResultsError, SimulatorResults
+from stochfuse.scenario.result import brief
 
 if TYPE_CHECKING:
     from stochfuse.prediction.general import Outcomes

@@ -46,7 +46,7 @@ from stochfuse.errors import NoAnswerError
 from stochfuse.kalman.algebra import FIELD
 from stochfuse.kalman.kernel import Estimate, at_step, predict
 from stochfuse.prediction.quantities import linear
-from stochfuse.prediction.result import Prediction, Result
+from stochfuse.prediction.result import Prediction
 from stochfuse.prediction.simplified import average, outcome
 from stochfuse.questions.question import (
     SLACK,
@@ -59,6 +59,7 @@ from stochfuse.questions.question import (
 )
 from stochfuse.scenario.network import number_of_senders
 from stochfuse.scenario.registry import OPTIMAL, SIMPLIFIED
+from stochfuse.scenario.result import Result
 from stochfuse.scenario.scenario import Scenario, of_scenario
 
 Function = Callable[[np.ndarray], np.ndarray]

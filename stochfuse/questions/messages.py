@@ -26,10 +26,10 @@ from stochfuse.engines.events import events
 from stochfuse.errors import UsageError
 from stochfuse.prediction.method import RUNS, SEED
 from stochfuse.prediction.predict import choose, predict
-from stochfuse.prediction.result import Result
 from stochfuse.questions.message_chain import frequencies, like_agents, naive_load, sampled_loads, walked_load
 from stochfuse.scenario.network import LinkRows, require_memoryless
 from stochfuse.scenario.registry import GENERAL, LFG, MONTE_CARLO, NAIVE
+from stochfuse.scenario.result import Result
 from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario, require_one_state
 
 RULES = (LFG, NAIVE)

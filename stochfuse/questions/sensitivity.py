@@ -26,10 +26,11 @@ from numpy.polynomial import Chebyshev
 from stochfuse.engines.events import events
 from stochfuse.errors import NoAnswerError, StochfuseError, UsageError
 from stochfuse.prediction.quantities import linear
-from stochfuse.prediction.result import Prediction, Result
+from stochfuse.prediction.result import Prediction
 from stochfuse.questions.question import Question, described, question
 from stochfuse.scenario.network import LinkRows, uniform_rows
 from stochfuse.scenario.registry import SIMPLIFIED
+from stochfuse.scenario.result import Result
 from stochfuse.scenario.scenario import Scenario, of_scenario
 
 MOST_AGENTS = 12

@@ -22,6 +22,8 @@ from stochfuse.scenario.links import MEMORY, Links
 from stochfuse.scenario.radio import distances
 
 SCHEMA = "stochfuse.links/1"
+NAMES = ("receiver", "sender")
+"""Axes of what is known of links, and the columns that name a link."""
 
 
 def links_report(found: Links, at: Sequence[int] | None = None) -> Report:
@@ -116,7 +118,7 @@ def links_table(found: Links) -> list[Table]:
     tables = [_matrix(names, found.link, head)]
     if found.sent is not None:
         title = ("Each link: Jeffreys interval; Δ back: less the link the other way; memory by likelihood ratio",)
-        tables.append(Table(title, ("receiver", "sender"), columns, tuple(rows)))
+        tables.append(Table(title, NAMES, columns, tuple(rows)))
     if found.delay is not None:
         delays = tuple((str(k), f"{p:.4f}") for k, p in enumerate(found.delay))
         tables.append(Table(("Delay of messages that arrive",), ("steps",), ("probability",), delays))
@@ -151,7 +153,17 @@ def links_csv(found: Links) -> str:
         step = (k + 1,) if found.varies else ()
         rows.append((*step, found.nodes[i], found.nodes[j], float(links[k, i, j]), *ends, *counts))
     step = ("step",) if found.varies else ()
-    return to_csv((*step, "receiver", "sender", "link", "low", "high", "sent", "received"), rows)
+    return to_csv((*step, *NAMES, "link", "low", "high", "sent", "received"), rows)
+
+
+def arrays(found: Links) -> dict[str, Any]:
+    """Return what an xarray.Dataset takes: (receiver, sender) arrays of all that is known, NaN where nothing is."""
+    known = {name: getattr(found, name) for name in ("link", "low", "high", "sent", "received", "memory")}
+    return {
+        "data_vars": {name: (NAMES, M) for name, M in known.items() if M is not None},
+        "coords": {name: list(found.nodes) for name in NAMES},
+        "attrs": {"source": found.source, "kind": found.kind},
+    }
 
 
 def links_json(found: Links) -> dict[str, Any]:
@@ -187,12 +199,10 @@ def _listed(M: np.ndarray) -> list[Any]:
 
 def network_table(found: Links) -> str:
     """Return the [network] table of a scenario; links of which nothing is known are not heard."""
-    n = len(found.nodes)
-    known = ~np.isnan(found.link)
     lines = [
         f"# Links of {found.source} ({found.kind}), receiver × sender{', one matrix per step' * found.varies}",
         "[network]",
-        f"agents = {n}",
+        f"agents = {len(found.nodes)}",
         f"steps = {found.steps or 10}",
         *([f'architecture = "{found.architecture}"'] if found.architecture != "ad-hoc" else []),
         f"nodes = {json.dumps(list(found.nodes), ensure_ascii=False)}",
@@ -205,10 +215,9 @@ def network_table(found: Links) -> str:
     else:
         lines.append(f"link = {_rows(found.link, exact=exact)}")
     if found.unknown:
-        hears = [[j + 1 for j in range(n) if known[i, j]] for i in range(n)]
-        lines += ["# nothing is known of the other links: they are taken for none", f"hears = {hears}"]
+        lines += ["# nothing is known of the other links: they are taken for none", f"hears = {found.hears}"]
     if found.delay is not None:
-        lines.append(f"delay = {[round(p, 6) for p in found.delay]}")
+        lines.append(f"delay = {list(found.delay)}")
     for name, link in found.cases:
         rows = _rows(link, exact=exact)
         lines += ["", "[[network.case]]", f"name = {json.dumps(name, ensure_ascii=False)}", f"link = {rows}"]

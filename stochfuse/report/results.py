@@ -16,11 +16,12 @@ from stochfuse.questions.critical import Critical
 from stochfuse.questions.least_link import LeastLink
 from stochfuse.questions.messages import MessageLoad
 from stochfuse.questions.sensitivity import Sensitivity, ShareOfGain
-from stochfuse.report import comparisons, fusion_graph, messages, predictions, solutions, study_figures
+from stochfuse.report import comparisons, fusion_graph, links, messages, predictions, solutions, study_figures
 from stochfuse.report.critical import critical_report
 from stochfuse.report.plot import figure_class
 from stochfuse.report.predictions import PredictionView
 from stochfuse.report.table import Report, to_html, to_text
+from stochfuse.scenario.links import Links
 from stochfuse.studies.files import Results
 
 SHEETS = {
@@ -48,6 +49,8 @@ def report_of(result: Any, of: str | None = None, agent: int | str = "mean") -> 
         return messages.load_report(messages.LoadView((result,), result))
     if isinstance(result, Results):
         return study_figures.summary_report(result, 5)
+    if isinstance(result, Links):
+        return links.links_report(result)
     scenario = (result if isinstance(result, Prediction) else result.predictions[0]).scenario
     chosen = metric(of or scenario.metric or "trace", scenario.model)
     if isinstance(result, EstimatorComparison):
@@ -109,6 +112,10 @@ def frame_of(result: Any, **shown: Any) -> Any:
     pandas = installed("pandas")
     if isinstance(result, Results):
         return pandas.read_parquet(result.path) if result.path.suffix == ".parquet" else pandas.read_csv(result.path)
+    if isinstance(result, Links):  # nodes' names stay names, whatever they look like ("1", "NA")
+        names = dict.fromkeys(links.NAMES, str)
+        text = io.StringIO(report_of(result).csv())
+        return pandas.read_csv(text, converters=names, keep_default_na=False, na_values=[""])
     frame = pandas.read_csv(io.StringIO(report_of(result, **shown).csv()))
     if isinstance(result, Prediction) and "faults" in result.meta:
         frame.insert(0, "item", [item for item in range(len(result.link)) for _ in result.steps])
@@ -118,11 +125,14 @@ def frame_of(result: Any, **shown: Any) -> Any:
 def arrays_of(result: Any) -> Any:
     """Return covariances as an xarray.DataArray with named axes, of several predictions one along a further axis.
 
-    Axes are link (or case), step, agent, row and column; of a bias there is no column.
+    Axes are link (or case), step, agent, row and column; of a bias there is no column.  Of links it is a Dataset, its
+    axes receiver and sender.
     """
     xarray = installed("xarray")
     if isinstance(result, Prediction):
         return _array(xarray, result)
+    if isinstance(result, Links):
+        return xarray.Dataset(**links.arrays(result))
     if isinstance(result, Comparison | EstimatorComparison):
         axis = "method" if isinstance(result, Comparison) else "estimator"
         names = result.methods if isinstance(result, Comparison) else result.estimators

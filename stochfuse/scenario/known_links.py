@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from stochfuse.errors import UsageError
-from stochfuse.scenario.links import Links, links_of_packets, read_links
+from stochfuse.scenario.links import Links, links_of_table, read_links
 from stochfuse.scenario.network import Network, reachable
 from stochfuse.scenario.scenario import Scenario, is_preset, load_scenario
 
@@ -26,9 +26,9 @@ def links(source: Any, **how: Any) -> Links:
 
     Parameters
     ----------
-    source : a path, see `read_links`; columns by name or a DataFrame, see `links_of_packets`; or a scenario: one, a
+    source : a path, see `read_links`; columns by name or a DataFrame, see `links_of_table`; or a scenario: one, a
         preset's name, a path that ends in .toml or .json, or a mapping with a scenario file's keys.
-    **how : columns, sent, step of a file; step of a log.
+    **how : columns, sent, step; see `read_links`.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def links(source: Any, **how: Any) -> Links:
         return links_of_scenario(source if isinstance(source, Scenario) else load_scenario(source))
     if isinstance(source, str | Path):
         return read_links(source, **how)
-    return links_of_packets(source, **how)
+    return links_of_table(source, **how)
 
 
 def is_scenario(source: Any) -> bool:

@@ -32,7 +32,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stochfuse.errors import StochfuseError, UsageError, nearest
+from stochfuse.errors import Problem, ScenarioError, UsageError, nearest, needed
+from stochfuse.scenario.result import Result
 
 if TYPE_CHECKING:
     from stochfuse.scenario.radio import Radio
@@ -47,11 +48,13 @@ LONGEST_LINE = 1 << 20
 WRAP = 1 << 16
 LARGEST = float(1 << 53)
 """Whole numbers up to which a file's are told apart."""
+NOTHING = ("", "nan", "None", "<NA>", "NaT")
+"""What an empty cell says as text, in a file and in the several kinds of frames."""
 COLUMNS = ("seq", "sender", "receiver", "received", "time", "sent_time", "received_time", "rssi", "link")
 
 
-@dataclass(frozen=True, eq=False)
-class Links:
+@dataclass(frozen=True, eq=False, repr=False)
+class Links(Result):
     """What is known of the links between nodes.
 
     Parameters
@@ -106,6 +109,12 @@ class Links:
         off = ~np.eye(len(self.nodes), dtype=bool)
         return [(self.nodes[i], self.nodes[j]) for i, j in np.argwhere(np.isnan(self.link) & off)[:, -2:]]
 
+    @property
+    def hears(self) -> list[list[int]]:
+        """Whom each node is known to hear, well or badly, numbered from 1: network.hears of a scenario."""
+        off = ~np.eye(len(self.nodes), dtype=bool)
+        return [(np.flatnonzero(row) + 1).tolist() for row in ~np.isnan(self.link) & off]
+
     def of(self, nodes: Sequence[str]) -> Links:
         """Return the links between some of the nodes, in that order.
 
@@ -142,6 +151,90 @@ class Links:
         )
 
 
+def links_of_table(source: Any, **how: Any) -> Links:
+    """Return what is known of links from a table that has a file's columns.
+
+    Parameters
+    ----------
+    source : columns by name: a mapping, a frame of pandas or polars, a table of Arrow; or a pandas frame that is a
+        matrix µ_ij (index: receivers, columns: senders, the same names), NaN where nothing is known.
+    **how : columns, sent, step; see `read_links`.
+
+    Raises
+    ------
+    UsageError
+        If it is none of these; with line and column.
+    """
+    if hasattr(source, "index") and hasattr(source, "columns") and list(source.index) == list(source.columns):
+        return _frame_matrix(source)
+    return _of_columns("table", _columns(source), **how)
+
+
+def _columns(table: Any) -> dict[str, Any]:
+    """Columns by name, of whatever has them."""
+    for names in ("column_names", "columns"):  # Arrow's; those of pandas and polars
+        if hasattr(table, names):
+            return {str(name): table[name] for name in getattr(table, names)}
+    if not isinstance(table, Mapping):
+        raise UsageError(f"links: expected a path, or a table with columns by name, got {type(table).__name__}")
+    found = {str(name): column for name, column in table.items()}
+    lengths = {name: len(column) if hasattr(column, "__len__") else 1 for name, column in found.items()}
+    if len(set(lengths.values())) > 1:
+        got = ", ".join(f"{length} of {name}" for name, length in lengths.items())
+        raise UsageError(f"links: expected columns of one length, got {got}")
+    return found
+
+
+def _frame_matrix(frame: Any) -> Links:
+    """Links of a square frame with the same names on both sides; unnamed nodes are numbered from 1."""
+    names = [str(name) for name in frame.columns]
+    if names == [str(i) for i in range(len(names))]:
+        names = [str(i + 1) for i in range(len(names))]
+    cells = [["" if value != value else str(value) for value in row] for row in frame.to_numpy(dtype=object)]
+    return _matrix("table", names, names, cells)
+
+
+def as_network(
+    found: Links, network: Mapping[str, Any], name: str, key: str = "network.link", *, silent: bool = False
+) -> dict[str, Any]:
+    """Return a scenario's [network] with links that are known in the place of what names them.
+
+    Parameters
+    ----------
+    network : its other keys; `nodes` picks some of the nodes, in that order, `hears` says which links there are.
+    name, key : the scenario's name and the key that holds the links, for messages.
+    silent : whether nothing is heard on links that are unknown, where `hears` is not given.
+
+    Raises
+    ------
+    ScenarioError
+        If they do not fit the agents, or leave a link unknown that may be heard.
+    """
+    nodes, agents = network.get("nodes"), network.get("agents")
+    try:
+        found = found.of([str(node) for node in nodes]) if isinstance(nodes, list) else found
+    except UsageError as error:
+        raise ScenarioError(name, [Problem(key, "links of network.nodes", f"({error})")]) from None
+    if silent and found.unknown and "hears" not in network:
+        network = {**network, "hears": found.hears}
+    n, link, hears = len(found.nodes), found.link.copy(), network.get("hears")
+    if agents is not None and agents != n:
+        raise ScenarioError(name, [Problem("network.agents", f"{n}, the nodes of {found.source}", str(agents))])
+    for i, j in np.argwhere(np.isnan(link)).tolist():
+        if i != j and not (isinstance(hears, list) and i < len(hears) and j + 1 not in (hears[i] or [])):
+            expected = "links that are all known, or network.hears without the unknown ones"
+            raise ScenarioError(
+                name, [Problem(key, expected, f"nothing known of {found.nodes[j]} to {found.nodes[i]}")]
+            )
+        link[i, j] = 0.0
+    made = {**network, "agents": n, "nodes": list(found.nodes), "link": link.tolist()}
+    if found.delay is not None:
+        made.setdefault("delay", list(found.delay))
+    if found.sent is not None and found.received is not None:
+        made |= {"sent": found.sent.tolist(), "received": found.received.tolist()}
+    return made
+
+
 def read_links(
     source: str | Path,
     *,
@@ -167,7 +260,18 @@ def read_links(
     name, text, table = _opened(source)
     if table is None and text.lstrip("\ufeff").startswith("{"):
         text = text.partition("\n")[2]
-    table = _table(name, text) if table is None else table
+    return _of_columns(name, _table(name, text) if table is None else table, columns=columns, sent=sent, step=step)
+
+
+def _of_columns(
+    name: str,
+    table: dict[str, Any],
+    *,
+    columns: Mapping[str, str] | None = None,
+    sent: int | None = None,
+    step: float | None = None,
+) -> Links:
+    """Links of a table, which its columns tell apart."""
     table = _renamed(name, table, columns or {})
     known = set(table)
     if {"mac", "srcmac"} <= known:
@@ -437,8 +541,7 @@ def _words(name: str, table: Mapping[str, Any], column: str) -> np.ndarray:
     given = table[column]
     words = given.to_numpy() if hasattr(given, "to_numpy") else np.asarray(given)
     words = np.asarray(words).astype(str)
-    blank = np.char.strip(words) == "" if words.size else np.zeros(0, dtype=bool)
-    _refuse(name, column, words, blank | (words == "nan") | (words == "None"), "a name")
+    _refuse(name, column, words, np.isin(np.char.strip(words), NOTHING), "a name")
     return np.char.strip(words) if words.size else words
 
 
@@ -456,11 +559,12 @@ def _numbers(
     if hasattr(given, "dictionary_encode"):
         given = _cast(given)
     raw = given.to_numpy() if hasattr(given, "to_numpy") else np.asarray(given)
+    raw = _seconds(given, raw)
     if raw.dtype.kind in "biuf":
         values = raw.astype(float)
     else:
         words = np.asarray(raw).astype(str)
-        words = np.where(np.char.strip(words) == "", "nan", words)
+        words = np.where(np.isin(np.char.strip(words), NOTHING), "nan", words)
         try:
             values = words.astype(float)
         except ValueError:
@@ -480,11 +584,19 @@ def _numbers(
     return values
 
 
+def _seconds(given: Any, raw: np.ndarray) -> np.ndarray:
+    """Times as seconds, NaN where there is none; anything else as it is."""
+    if getattr(getattr(given, "dtype", None), "kind", "") == "M" or raw.dtype.kind == "M":
+        raw = np.asarray(given if raw.dtype.kind == "O" else raw, dtype="datetime64[ns]")
+        return np.where(np.isnat(raw), np.nan, raw.astype(np.int64) / 1e9)
+    return raw
+
+
 def _cast(column: Any) -> Any:
-    """A column of texts as numbers, if all of them are; else as it is."""
+    """An Arrow column as numbers, if all of it is; else as it is."""
     try:
         return column.cast("float64")
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, NotImplementedError):
         return column
 
 
@@ -502,7 +614,7 @@ def _refuse(
     if len(found):
         line = int(found[0] if lines is None else lines[found[0]]) + 2
         got = str(values[found[0]])
-        got = "nothing" if got in ("", "nan") else f"'{_one_line(got)[:40]}'"
+        got = "nothing" if got in NOTHING else f"'{_one_line(got)[:40]}'"
         raise UsageError(f"{name}, line {line}, column '{column}': expected {expected}, got {got}")
 
 
@@ -548,7 +660,7 @@ def _coded(name: str, table: Mapping[str, Any], column: str) -> tuple[list[str],
     else:
         names, codes = np.unique(np.asarray(given).astype(str), return_inverse=True)
     words = [_one_line(str(word)) for word in names]
-    wrong = np.array([word in ("", "nan", "None") for word in words], dtype=bool)
+    wrong = np.array([word in NOTHING for word in words], dtype=bool)
     if wrong.any():
         _refuse(name, column, np.array(words)[codes], wrong[codes], "a name")
     return words, codes.astype(np.int64)
@@ -709,9 +821,4 @@ def _delays(source: str, table: Mapping[str, Any], step: float | None) -> tuple[
 
 
 def _arrow(name: str) -> Any:
-    from importlib import import_module
-
-    try:
-        return import_module(name)
-    except ImportError:
-        raise StochfuseError("files of links need pyarrow: pip install 'stochfuse[study]'") from None
+    return needed(name, "study", "files of links need")

@@ -22,7 +22,6 @@ import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, wraps
-from numbers import Real
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
@@ -229,32 +228,16 @@ def with_links(mapping: Any, name: str, folder: Path) -> Any:
     given = network.get("link") if isinstance(network, Mapping) else None
     if not isinstance(network, Mapping) or not (isinstance(given, Mapping) and isinstance(given.get("file"), str)):
         return mapping
-    from stochfuse.scenario.links import read_links
+    from stochfuse.scenario.links import as_network, read_links
 
-    nodes, agents = network.get("nodes") or _all_names(mapping.get("agent")), network.get("agents")
     try:
         found = read_links(folder / given["file"])
-        found = found.of([str(node) for node in nodes]) if isinstance(nodes, list) else found
     except UsageError as error:
         raise ScenarioError(name, [Problem("network.link.file", "a file of links", f"({error})")]) from None
-    n = len(found.nodes)
-    if agents is not None and agents != n:
-        raise ScenarioError(name, [Problem("network.agents", f"{n}, the nodes of {given['file']}", str(agents))])
-    link, hears = found.link.copy(), network.get("hears")
-    for i, j in np.argwhere(np.isnan(link)).tolist():
-        heard = i != j and not (isinstance(hears, list) and i < len(hears) and j + 1 not in (hears[i] or []))
-        if heard:
-            expected = "a file that knows every link, or network.hears without the unknown ones"
-            got = f"nothing known of {found.nodes[j]} to {found.nodes[i]}"
-            raise ScenarioError(name, [Problem("network.link.file", expected, got)])
-        link[i, j] = 0.0
-    counted = (
-        {"sent": found.sent.tolist(), "received": found.received.tolist()}
-        if found.sent is not None and found.received is not None
-        else {}
-    )
-    made = {**network, "agents": n, "nodes": list(found.nodes), "link": link.tolist(), **counted}
-    return {**mapping, "network": made}
+    found = replace(found, source=given["file"])
+    nodes = network.get("nodes") or _all_names(mapping.get("agent"))
+    network = network if nodes is None else {**network, "nodes": nodes}
+    return {**mapping, "network": as_network(found, network, name, "network.link.file")}
 
 
 def _all_names(tables: Any) -> list[str] | None:
@@ -277,7 +260,7 @@ def folder_of(source: str | Path) -> Path:
 
 
 def as_file(mapping: Any, name: str) -> Any:
-    """A mapping as a file would have it: lists for arrays and tuples, Python's numbers for NumPy's.
+    """A mapping as a file would have it: lists for arrays, frames and tuples, Python's numbers for NumPy's.
 
     Raises
     ------
@@ -293,6 +276,8 @@ def as_file(mapping: Any, name: str) -> Any:
 def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {str(key): _plain(entry) for key, entry in value.items()}
+    if hasattr(value, "to_numpy"):  # frames
+        value = value.to_numpy()
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     return [_plain(entry) for entry in value] if isinstance(value, list | tuple) else value
@@ -460,7 +445,7 @@ def _override_noise(mapping: dict[str, Any], entry: str, value: Any) -> None:
 
 def _root(key: str, variance: Any) -> Any:
     """Standard deviation of a variance; a negative one is left for the reading to refuse."""
-    if not isinstance(variance, Real):
+    if not isinstance(variance, int | float):
         raise UsageError(f"{key}: expected a variance, in the place of a standard deviation, got {shown(variance)}")
     return float(variance) ** 0.5 if variance >= 0 else variance
 

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from stochfuse.errors import UsageError
-from stochfuse.prediction.result import Result
+from stochfuse.scenario.result import Result
 from stochfuse.studies.evaluation import Answers
 from stochfuse.studies.plan import Plan
 

@@ -26,6 +26,7 @@ RESULTS = {
     "sensitivity": lambda: sf.sensitivity(MINE, 0.5),
     "gain": lambda: sf.share_of_gain(MINE, [0.5]),
     "load": lambda: sf.message_load(MINE, [0.5]),
+    "links": lambda: sf.links({"seq": [1, 2, 3], "sender": ["1"] * 3, "receiver": ["NA"] * 3, "received": [1, 0, 1]}),
     "study": lambda path: sf.study({"vary": {"network.link": [0, 0.5, 1]}}, path / "study.parquet"),
 }
 
@@ -125,6 +126,15 @@ def test_a_missing_library_is_named_with_the_line_that_installs_it(monkeypatch):
     monkeypatch.setattr(results, "import_module", missing)
     with pytest.raises(sf.StochfuseError, match=r"this needs xarray: pip install 'stochfuse\[data\]'"):
         sf.predict(MINE, [0.5]).to_xarray()
+
+
+def test_links_keep_the_names_of_nodes():
+    links = RESULTS["links"]()
+    frame, arrays = links.to_dataframe(), links.to_xarray()
+    assert frame[["receiver", "sender", "sent", "received"]].to_numpy().tolist() == [["NA", "1", 3, 2]]
+    assert float(arrays.link.sel(receiver="NA", sender="1")) == frame.link[0] == pytest.approx(2 / 3)
+    assert float(arrays.link.isnull().sum()) == 3
+    assert list(arrays.sender.values) == ["1", "NA"]
 
 
 def test_axes_of_ones_own():

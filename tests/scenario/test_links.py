@@ -194,6 +194,64 @@ def test_frames_and_parquet_are_logs_too(tmp_path):
         assert found.link[1, 0] == pytest.approx(2 / 3)
 
 
+PACKETS = {"seq": [1, 2, 3, 1, 2], "sender": ["1", "1", "1", "NA", "NA"], "receiver": ["NA", "NA", "NA", "1", "1"], "received": [True, False, True, True, True]}  # fmt: skip
+FRAMES = {
+    "mapping": lambda: PACKETS,
+    "arrays": lambda: {name: np.array(column) for name, column in PACKETS.items()},
+    "pandas": lambda: pytest.importorskip("pandas").DataFrame(PACKETS),
+    "pandas, nullable": lambda: pytest.importorskip("pandas").DataFrame(PACKETS).convert_dtypes(),
+    "pandas, categories": lambda: pytest.importorskip("pandas").DataFrame(PACKETS).astype({"sender": "category"}),
+    "pyarrow": lambda: pytest.importorskip("pyarrow").table(PACKETS),
+    "polars": lambda: pytest.importorskip("polars").DataFrame(PACKETS),
+}
+
+
+@pytest.mark.parametrize("kind", FRAMES)
+def test_every_kind_of_frame_is_read_alike(kind):
+    found = sf.links(FRAMES[kind]())
+    assert found.nodes == ("1", "NA")
+    assert found.received.tolist() == [[0, 2], [2, 0]]
+    assert found.sent.tolist() == [[0, 2], [3, 0]]
+
+
+def test_frames_may_be_edge_lists_and_matrices_too():
+    pandas = pytest.importorskip("pandas")
+    edges = sf.links(PACKETS).to_dataframe()
+    matrix = edges.pivot(index="receiver", columns="sender", values="link")
+    renamed = edges.rename(columns={"receiver": "to"})
+    for found in (sf.links(edges), sf.links(matrix), sf.links(renamed, columns={"receiver": "to"})):
+        assert found.nodes == ("1", "NA")
+        assert found.link[1, 0] == pytest.approx(2 / 3)
+        assert found.hears == [[2], [1]]
+    assert sf.links(pandas.DataFrame([[1.0, 0.5], [0.2, 1.0]])).nodes == ("1", "2")
+    with pytest.raises(sf.UsageError, match=r"line 3, column 'a': expected a probability between 0 and 1, got '1.5'"):
+        sf.links(pandas.DataFrame([[0, 0.5], [1.5, 0]], ["a", "b"], ["a", "b"]))
+
+
+@pytest.mark.parametrize("zone", [None, "UTC"])
+def test_delays_come_from_times_of_a_frame(zone):
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame(PACKETS)
+    frame["sent_time"] = pandas.date_range("2024-01-01", periods=5, freq="s", tz=zone)
+    frame["received_time"] = frame["sent_time"] + pandas.to_timedelta([0.5, 0.1, 2.5, 0.2, 0.9], unit="s")
+    frame.loc[1, "received_time"] = pandas.NaT
+    assert sf.links(frame, step=1.0).delay == (0.75, 0.0, 0.25)
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        (5, "links: expected a path, or a table with columns by name, got int"),
+        ({"seq": [1, 2], "sender": ["a"]}, "links: expected columns of one length, got 2 of seq, 1 of sender"),
+        ({"seq": [1]}, "table: expected columns seq, sender, receiver, received"),
+        ({"seq": [1], "sender": [None], "receiver": ["b"]}, "line 2, column 'sender': expected a name, got nothing"),
+    ],
+)
+def test_tables_that_are_no_links(table, message):
+    with pytest.raises(sf.UsageError, match=message):
+        sf.links(table)
+
+
 MODEL = "[model]\nF=1\nH=1\nQ=1\nR=4\n[initial]\nP=9\n"
 
 
@@ -228,6 +286,14 @@ def test_links_that_do_not_fit_a_scenario(tmp_path, network, message):
     written(tmp_path, "receiver,sender,link\na,b,0.5\n", "some.csv")
     path = written(tmp_path, MODEL + f"[network]\nsteps=3\n{network}\n", "s.toml")
     assert message in run("scenario", "check", path, code=2).stderr
+
+
+def test_delays_that_are_written_sum_to_one(tmp_path):
+    rows = "".join(f"{k},{s},{r},1,{k},{k + k % 3 + 0.5}\n" for s, r in ("ab", "ba") for k in range(9))
+    log = written(tmp_path, "seq,sender,receiver,received,sent_time,received_time\n" + rows)
+    run("links", log, "--step", "1", "--write", tmp_path / "net.toml")
+    path = written(tmp_path, MODEL + (tmp_path / "net.toml").read_text(), "s.toml")
+    assert sf.load_scenario(path).network.delay == (1 / 3, 1 / 3, 1 / 3)
 
 
 def test_a_network_that_is_written_can_be_predicted(tmp_path):
