@@ -138,6 +138,11 @@ class Over:
         with _named(self.label(point)):
             yield
 
+    def check(self, link: Any) -> None:
+        """Raise UsageError if a link probability is swept and given too."""
+        if link is not None and any(key.name == LINK for key in self.keys):
+            raise UsageError(f"over {LINK}: expected no link probabilities beside it")
+
     def items(self, link: Any) -> Items | None:
         """All points at their links as items of the first scenario's system, link rows running fastest.
 
