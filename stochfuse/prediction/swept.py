@@ -22,7 +22,8 @@ from stochfuse.scenario.over import Over
 from stochfuse.scenario.registry import NATURES
 from stochfuse.scenario.scenario import Scenario
 
-T, Answer = TypeVar("T"), TypeVar("Answer")
+T = TypeVar("T")
+Answer = TypeVar("Answer")
 _NATURES: list[str] = list(NATURES)
 
 

@@ -196,7 +196,7 @@ class SweptLoad(Result):
 
     @property
     def nature(self) -> str:
-        """ "exact" or "sampled"."""
+        """How certain: "exact" or "sampled"."""
         return self.parts[0].nature
 
     @property
@@ -459,7 +459,8 @@ def accuracy(
     if isinstance(load, SweptLoad):
         asked = {"metric": metric, "quantity": quantity, "agent": agent, "method": method, **settings}
         each = of_parts(load.over, load.parts, lambda part: accuracy(part, link, **asked))
-        error = None if each[0].error is None else np.concatenate([one.error for one in each])
+        errors = [one.error for one in each if one.error is not None]
+        error = np.concatenate(errors) if errors else None
         predictions = Swept(load.over, tuple(one.prediction for one in each))
         return Accuracy(load, predictions, np.concatenate([one.values for one in each]), error)
     scenario, last = load.scenario, int(load.steps[-1])
