@@ -32,11 +32,14 @@ if TYPE_CHECKING:
     from stochfuse.prediction.result import Prediction as Prediction
     from stochfuse.prediction.states import predict_states as predict_states
     from stochfuse.prediction.steady_state import steady_state as steady_state
+    from stochfuse.prediction.swept import Swept as Swept
     from stochfuse.questions.agents_needed import AgentsNeeded as AgentsNeeded
     from stochfuse.questions.agents_needed import agents_needed as agents_needed
     from stochfuse.questions.crosscheck import check_results as check_results
     from stochfuse.questions.least_link import LeastLink as LeastLink
     from stochfuse.questions.least_link import least_link as least_link
+    from stochfuse.questions.least_value import LeastValue as LeastValue
+    from stochfuse.questions.least_value import least_value as least_value
     from stochfuse.questions.messages import MessageLoad as MessageLoad
     from stochfuse.questions.messages import message_load as message_load
     from stochfuse.questions.results import read_results as read_results
@@ -56,6 +59,7 @@ _HOME = {
     "Comparison": "prediction.compare",
     "FusionGraph": "estimators.fusion_graph",
     "LeastLink": "questions.least_link",
+    "LeastValue": "questions.least_value",
     "MessageLoad": "questions.messages",
     "NoAnswerError": "errors",
     "Prediction": "prediction.result",
@@ -63,6 +67,7 @@ _HOME = {
     "ScenarioError": "errors",
     "Sensitivity": "questions.sensitivity",
     "StochfuseError": "errors",
+    "Swept": "prediction.swept",
     "UsageError": "errors",
     "agents_needed": "questions.agents_needed",
     "check_results": "questions.crosscheck",
@@ -72,6 +77,7 @@ _HOME = {
     "derive_optimal": "symbolic.optimal",
     "derive_simplified": "symbolic.simplified",
     "least_link": "questions.least_link",
+    "least_value": "questions.least_value",
     "links": "scenario.links",
     "load_history": "estimators.fusion_graph",
     "load_scenario": "scenario.scenario",
@@ -91,6 +97,7 @@ __all__ = [
     "Comparison",
     "FusionGraph",
     "LeastLink",
+    "LeastValue",
     "MessageLoad",
     "NoAnswerError",
     "Prediction",
@@ -98,6 +105,7 @@ __all__ = [
     "ScenarioError",
     "Sensitivity",
     "StochfuseError",
+    "Swept",
     "UsageError",
     "__version__",
     "agents_needed",
@@ -108,6 +116,7 @@ __all__ = [
     "derive_optimal",
     "derive_simplified",
     "least_link",
+    "least_value",
     "links",
     "load_history",
     "load_scenario",

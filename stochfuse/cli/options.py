@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import wraps
 from math import floor, inf, isfinite, log10
 from pathlib import Path
@@ -189,10 +189,15 @@ class Changes(NamedTuple):
         from stochfuse.scenario import over
 
         given = over_values(texts)
-        for flag, key in PLACES.items():
-            if key in given and getattr(self, flag) is not None:
-                raise UsageError(f"--over {key}: expected without --{flag}, which sets the same")
+        self.check_unset(given)
         return over.over(scenario, given)
+
+    def check_unset(self, keys: Iterable[str]) -> None:
+        """Raise UsageError if an option sets one of some keys."""
+        for key in keys:
+            flag = next((flag for flag, place in PLACES.items() if place == key), None)
+            if flag is not None and getattr(self, flag) is not None:
+                raise UsageError(f"--over {key}: expected without --{flag}, which sets the same")
 
 
 PLACES = {
@@ -459,13 +464,39 @@ def over_values(texts: Sequence[str]) -> dict[str, list[float]]:
         raise UsageError(f"--over: expected it once or twice, got it {len(texts)} times; for more see stochfuse study")
     found: dict[str, list[float]] = {}
     for text in texts:
-        key, equals, spec = (part.strip() for part in text.partition("="))
-        if not key or not equals or not spec:
-            raise UsageError(f"--over: expected KEY=SPEC such as network.delay=0:3:1 or model.R=50,100, got '{text}'")
+        key, spec = _key_and(text, "KEY=SPEC such as network.delay=0:3:1 or model.R=50,100")
         if key in found:
             raise UsageError(f"--over: expected different keys, got {key} twice")
         found[key] = _numbers(f"--over {key}", spec)
     return found
+
+
+def over_ends(texts: Sequence[str]) -> tuple[str, tuple[float, float]]:
+    """Return the key and the ends of `network.delay=0:10`.
+
+    Raises
+    ------
+    UsageError
+        If the text is malformed, or there are several.
+    """
+    if len(texts) > 1:
+        raise UsageError(f"--over: expected it once with --target, got it {len(texts)} times")
+    expected = "KEY=LO:HI such as model.R=50:200"
+    key, spec = _key_and(texts[0], expected)
+    try:
+        low, high = map(_number, spec.split(":"))
+    except ValueError:
+        raise UsageError(f"--over: expected {expected}, got '{texts[0]}'") from None
+    if low >= high:
+        raise UsageError(f"--over {key}: expected LO:HI with LO < HI, got '{spec}'")
+    return key, (low, high)
+
+
+def _key_and(text: str, expected: str) -> tuple[str, str]:
+    key, _, spec = (part.strip() for part in text.partition("="))
+    if not key or not spec:
+        raise UsageError(f"--over: expected {expected}, got '{text}'")
+    return key, spec
 
 
 def _numbers(flag: str, text: str, low: float = -inf, high: float = inf) -> list[float]:

@@ -20,6 +20,7 @@ from stochfuse.cli.options import (
     check_memory,
     choice,
     option,
+    over_ends,
     settings_for,
     whose,
 )
@@ -46,6 +47,10 @@ class Asked(NamedTuple):
     agents_needed: Annotated[
         bool, option("With --target and --link: the least number of agents instead.", QUESTION, "--agents-needed")
     ] = False
+    over: Annotated[
+        list[str] | None,
+        option("With --target: least or greatest value of that key instead.", QUESTION, "--over", metavar="KEY=LO:HI"),
+    ] = None
     sensitivity: Annotated[
         bool, option("What each link is worth, and which to improve first.", QUESTION, "--sensitivity")
     ] = False
@@ -68,6 +73,7 @@ class Asked(NamedTuple):
         """
         return _question(
             self.target,
+            over=bool(self.over),
             agents_needed=self.agents_needed,
             sensitivity=self.sensitivity,
             gain=self.gain,
@@ -110,10 +116,10 @@ def solve(
     to.check(scenario)
     kind = asked_for.kind
     for flag, value, wanted in (
-        ("--link", changes.link, ("agents-needed", "sensitivity", "gain", "steady")),
+        ("--link", changes.link, ("agents-needed", "sensitivity", "gain", "steady", "over")),
         ("--case", case, ("sensitivity",)),
         ("--max-agents", max_agents, ("agents-needed",)),
-        ("--agents", changes.agents, ("target", "sensitivity", "gain", "steady")),
+        ("--agents", changes.agents, ("target", "sensitivity", "gain", "steady", "over")),
     ):
         if value is not None and kind not in wanted:
             raise UsageError(f"{flag}: expected with --{', --'.join(wanted)}; got it with --{kind}")
@@ -128,16 +134,27 @@ def solve(
     given, links = changes.of(scenario)
     check_memory(given, links, to.kind)
     asked["agent"] = whose(agent, given)
+    if asked_for.over:
+        key, between = over_ends(asked_for.over)
+        changes.check_unset([key])
+        asked |= {"key": key, "between": between}
     sheet, found = _answer(kind, given, links, asked_for.target, case, max_agents, to.digits, asked)
     _note(sheet)
     to.write(solutions.solution_report(sheet, found))
 
 
-def _question(target: float | None, *, agents_needed: bool, sensitivity: bool, gain: bool, steady: bool) -> str:
+def _question(
+    target: float | None, *, over: bool, agents_needed: bool, sensitivity: bool, gain: bool, steady: bool
+) -> str:
     questions = {"target": target is not None, "sensitivity": sensitivity, "gain": gain}
     chosen = [name for name, wanted in questions.items() if wanted]
     if len(chosen) > 1:
         raise UsageError(f"expected one question a call, got --{' and --'.join(chosen)}")
+    if over and (chosen != ["target"] or agents_needed):
+        got = "--agents-needed" if agents_needed else f"--{chosen[0]}" if chosen else "no --target"
+        raise UsageError(f"--over: expected --target X with it, got {got}")
+    if over:
+        return "over"
     if agents_needed:
         if chosen != ["target"]:
             raise UsageError("--agents-needed: expected --target X and --link P with it, got no --target")
@@ -160,13 +177,17 @@ def _answer(
     digits: int,
     asked: dict[str, Any],
 ) -> tuple[SolutionSheet, Any]:
-    from stochfuse.questions import agents_needed, least_link, sensitivity
+    from stochfuse.questions import agents_needed, least_link, least_value, sensitivity
     from stochfuse.questions.question import question
     from stochfuse.report import solutions
 
     if kind == "target":
         found = least_link.least_link(given, target or 0.0, **asked)
         return solutions.least_link_sheet(found, digits), found
+    if kind == "over":
+        at = None if links is None else _single(links, kind)
+        found = least_value.least_value(given, target or 0.0, link=at, **asked)
+        return solutions.value_sheet(found, digits), found
     if kind == "agents-needed":
         found = agents_needed.agents_needed(given, target or 0.0, _single(links, kind), max_agents=max_agents, **asked)
         return solutions.agents_sheet(found, digits), found

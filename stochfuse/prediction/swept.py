@@ -161,7 +161,7 @@ class Swept(Result):
 
     def values(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray:
         """Return a metric, shape (rows, steps), not-a-number where a point has no such step; see `Prediction`."""
-        return below_each_other(self._read(lambda part: part.values(of, agent)))
+        return below_each_other(self.each(lambda part: part.values(of, agent)))
 
     def statistic(self, name: str, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray:
         """Return a statistic of a metric over the outcomes, shape (rows, steps).
@@ -173,11 +173,11 @@ class Swept(Result):
         """
         if name != "mean" and len(self.parts) < len(self.over.points) and self.parts[0].outcomes is None:
             raise UsageError(f"statistic '{name}': expected points predicted one by one (one_by_one=True)")
-        return below_each_other(self._read(lambda part: part.statistic(name, of, agent)))
+        return below_each_other(self.each(lambda part: part.statistic(name, of, agent)))
 
     def standard_error(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray | None:
         """Return the standard error of `values`, 0 where nothing was sampled; None if nothing was at any point."""
-        errors = self._read(lambda part: part.standard_error(of, agent))
+        errors = self.each(lambda part: part.standard_error(of, agent))
         if all(error is None for error in errors):
             return None
         shapes = [(len(part.link), len(part.steps)) for part in self.parts]
@@ -185,14 +185,15 @@ class Swept(Result):
 
     def steady_values(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray | None:
         """Return a metric of the steady state, shape (rows,), or None if none was computed."""
-        found = self._read(lambda part: part.steady_values(of, agent))
+        found = self.each(lambda part: part.steady_values(of, agent))
         return None if found[0] is None else np.concatenate(found)
 
     def table(self, of: str | None = None, agent: int | str = "mean") -> str:
         """Return the table as text, as `stochfuse predict --over` prints it."""
         return stochfuse.shown("text_of", self, of=of, agent=agent)
 
-    def _read(self, read: Callable[[Prediction], Any]) -> list[Any]:
+    def each(self, read: Callable[[Prediction], Answer]) -> list[Answer]:
+        """Ask something of every part; an error names the point that it comes from."""
         if len(self.parts) == len(self.over.points):
             return of_parts(self.over, self.parts, read)
         return [read(part) for part in self.parts]

@@ -376,7 +376,7 @@ def draw_estimators(view: EstimatorView):
     panels = list(dict.fromkeys(axis_of))
     first = view.views[0][0]
     curves, cases = _drawn(first)
-    chosen = [len(curves.names) - 1] if curves.what == "steps" else spread(len(curves.names))[:MOST_GROUPS]
+    chosen = spread(len(curves.names))[:MOST_GROUPS]
     figure = Figure(figsize=(2.0 + 4.6 * len(panels), 1.4 + 4.0 * len(chosen)), layout="constrained")
     grid = figure.subplots(len(chosen), len(panels), squeeze=False)
     colors = [COLORS[e % len(COLORS)] for e in range(len(view.values))]
@@ -410,8 +410,7 @@ def draw_estimators(view: EstimatorView):
         if q != "consistency"
     ]
     below(figure, [*names, *kinds])
-    along = curves.what == "steps" or curves.at or cases
-    where = f"after step {first.steps[-1]}" if along else first.rows.name(0)
+    where = curves.at or first.rows.name(0)
     title = f"What estimators claim and what is true, {where}; {first.whom}"
     titled(figure, title)
     return figure
@@ -421,9 +420,9 @@ def _drawn(first: PredictionView) -> tuple[Curves, tuple[str, ...]]:
     """Along what estimators are drawn, and the cases if along these, one beside another."""
     cases = first.prediction.cases
     if cases is None or len(cases) == 1 or first.rows.over is not None:
-        return first.rows.curves(first.steps), ()
+        return first.rows.curves(first.steps, last=True), ()
     rows = np.arange(len(cases))
-    return Curves([rows], "", [""], [(rows, -1)], "rows"), cases
+    return Curves([rows], "", [""], [(rows, -1)], "rows", at=f"after step {first.steps[-1]}"), cases
 
 
 def _finish(axes: Any, label: str, curves: Curves, cases: Sequence[str]) -> None:

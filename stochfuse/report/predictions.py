@@ -230,12 +230,13 @@ class PredictionView:
         if p.method == OPTIMAL:
             nature = "exact" if p.nature == "exact" else "enclosed in proved bounds"
             return nature if p.meta["paths"] is None else f"{nature}, {counted(p.meta['paths'], 'path')}"
-        if p.outcomes is None:
+        if p.method == SIMPLIFIED:
             return "approximate (mean field)"
-        everything = counted(p.meta["outcomes"], "outcome")
-        if p.nature == "exact":
-            return f"exact, {everything}"
-        return f"approximate, {everything} less those of probability up to {np.max(p.meta['left_out']):.2g}"
+        # of noises that differ outcomes are listed without being counted together
+        everything = f", {counted(p.meta['outcomes'], 'outcome')}" if "outcomes" in p.meta else ""
+        if p.nature == "exact" or "left_out" not in p.meta:
+            return f"{p.nature}{everything}"
+        return f"approximate{everything} less those of probability up to {np.max(p.meta['left_out']):.2g}"
 
 
 def counted(number: int, what: str) -> str:

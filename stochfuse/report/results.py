@@ -13,6 +13,7 @@ from stochfuse.prediction.result import Prediction
 from stochfuse.prediction.swept import Swept
 from stochfuse.questions.agents_needed import AgentsNeeded
 from stochfuse.questions.least_link import LeastLink
+from stochfuse.questions.least_value import LeastValue
 from stochfuse.questions.messages import MessageLoad, SweptLoad
 from stochfuse.questions.sensitivity import Sensitivity, ShareOfGain
 from stochfuse.report import comparisons, messages, predictions, solutions, study_figures
@@ -25,6 +26,7 @@ from stochfuse.studies.files import Results
 SHEETS = {
     AgentsNeeded: solutions.agents_sheet,
     LeastLink: solutions.least_link_sheet,
+    LeastValue: solutions.value_sheet,
     Sensitivity: solutions.sensitivity_sheet,
     ShareOfGain: solutions.gain_sheet,
 }

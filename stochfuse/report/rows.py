@@ -131,12 +131,28 @@ class Rows:
         several = [] if self.over is None else [k for k, key in enumerate(self.over.keys) if len(key.values) > 1]
         return several[0] if several else None
 
-    def curves(self, steps: np.ndarray | None) -> Curves:
-        """Return along what values (rows, steps) are drawn; without steps they are (rows,)."""
+    def _last(self, rows: np.ndarray, steps: np.ndarray) -> np.ndarray:
+        """Place of the last of some steps that each row has."""
+        if not isinstance(self.result, Swept):
+            return np.full(len(rows), len(steps) - 1)
+        own = np.concatenate([np.full(len(part.link), part.steps[-1]) for part in self.result.parts])
+        return np.searchsorted(steps, own[rows], side="right") - 1
+
+    def curves(self, steps: np.ndarray | None, *, last: bool = False) -> Curves:
+        """Return along what values (rows, steps) are drawn; without steps they are (rows,).
+
+        Parameters
+        ----------
+        last : whether rows that are drawn along something are drawn at their last step only.
+        """
         if self.over is not None and self._main is not None:
-            return self._along_key(self.over, self._main, steps)
+            return self._along_key(self.over, self._main, steps, last)
         if self.result.cases is None and len(self.result.link) > 1:
-            order = np.argsort(self.result.link)
+            order = np.argsort(self.result.link, kind="stable")
+            if last and steps is not None:
+                at = f"after step {steps[-1]}"
+                picks = [(order, self._last(order, steps))]
+                return Curves([self.result.link[order]], "link probability µ", [""], picks, "rows", at=at)
             return _by_step(self.result.link[order], order, steps, "link probability µ")
         names = [self.name(row) for row in range(len(self.result.link))]
         if steps is None:
@@ -144,7 +160,7 @@ class Rows:
         picks = [(row, slice(None)) for row in range(len(names))]
         return Curves([steps] * len(names), "step k", names, picks, "rows", whole=True)
 
-    def _along_key(self, over: Over, main: int, steps: np.ndarray | None) -> Curves:
+    def _along_key(self, over: Over, main: int, steps: np.ndarray | None, last: bool) -> Curves:
         """Draw along a swept key: a curve a step, or where rows differ in more, a curve for each of that."""
         others = [k for k in range(len(over.keys)) if k != main and len(over.keys[k].values) > 1]
         groups: dict[Any, list[int]] = {}
@@ -154,12 +170,15 @@ class Rows:
         x = np.array([over.points[point][main] for point in self.point], dtype=float)
         rows = [np.array(members)[np.argsort(x[members], kind="stable")] for members in groups.values()]
         key = over.keys[main]
-        if len(rows) == 1:
+        if len(rows) == 1 and not (last and steps is not None):
             return _by_step(x[rows[0]], rows[0], steps, key.title, whole=key.whole)
         names = [", ".join([*self._named(int(some[0]), others), *self._beside(int(some[0]), each)]) for some in rows]
-        last = () if steps is None else (len(steps) - 1,)
-        at = "" if steps is None else f"at step {steps[-1]}"
-        return Curves([x[some] for some in rows], key.title, names, [(s, *last) for s in rows], "rows", key.whole, at)
+        label, x = key.title, [x[some] for some in rows]
+        if steps is None:
+            return Curves(x, label, names, [(some,) for some in rows], "rows", key.whole)
+        ends = [self._last(some, steps) for some in rows]
+        at = f"after step {steps[-1]}" if np.concatenate(ends).min() == len(steps) - 1 else "after the last step"
+        return Curves(x, label, names, list(zip(rows, ends, strict=True)), "rows", key.whole, at)
 
     def _beside(self, row: int, each: int) -> list[str]:
         """Which of a point's several links a row is of."""

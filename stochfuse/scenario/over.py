@@ -51,7 +51,7 @@ def put(mapping: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]
         if isinstance(last, int):
             _entered(path, place, last)
         elif not isinstance(place, dict):
-            raise _nowhere(path)
+            raise _nowhere(path, "it leads through what is no table")
         place[last] = value
         # a link probability takes the place of everything else that says how likely messages are
         if path == LINK:
@@ -73,11 +73,11 @@ def _entered(path: str, place: Any, part: str | int) -> Any:
         return place.setdefault(part, {})
     if isinstance(part, int) and isinstance(place, list) and 0 <= part < len(place):
         return place[part]
-    raise _nowhere(path)
+    raise _nowhere(path, f"the scenario lists no {part + 1} there" if isinstance(part, int) else "it leads nowhere")
 
 
-def _nowhere(path: str) -> ScenarioError:
-    return ScenarioError("scenario", [Problem(path, KEY, shown(path))])
+def _nowhere(path: str, why: str) -> ScenarioError:
+    return ScenarioError("scenario", [Problem(path, KEY, f"{shown(path)}, but {why}")])
 
 
 class Key(NamedTuple):
