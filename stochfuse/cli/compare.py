@@ -63,8 +63,8 @@ def compare(
     estimator: Annotated[
         str | None,
         option(
-            "Compare these estimators instead (stochfuse methods), what each claims beside what is true; all: those "
-            "that the scenario takes. One, with --methods: what these average.",
+            "Compare these estimators instead (stochfuse methods), claims beside truth; all: those that the scenario "
+            "takes. One, with --methods: what these average.",
             WORK,
             metavar="LIST",
             autocompletion=completed((*ESTIMATORS, ALL)),

@@ -43,7 +43,7 @@ class Shown(NamedTuple):
     ] = False
     cdf: Annotated[bool, option("Probabilities of at most so many nodes instead.", SHOWN, "--cdf")] = False
     accuracy: Annotated[
-        bool, option("Accuracy of the fused estimate beside the mean load instead.", SHOWN, "--accuracy")
+        bool, option("Accuracy of the fused estimate beside the load instead.", SHOWN, "--accuracy")
     ] = False
     metric: MetricOption = None
     quantity: Annotated[
@@ -65,7 +65,7 @@ def messages(
         str, choice((LFG, NAIVE, BOTH), f"Whose messages: {LFG}, {NAIVE} or both; default: both.", SHOWN)
     ] = BOTH,
     from_step: Annotated[
-        int | None, option("First step counted; default: 1. The last one is --steps.", SHOWN, min=1, metavar="K")
+        int | None, option("First step counted; default: 1; the last: --steps.", SHOWN, min=1, metavar="K")
     ] = None,
     step: Annotated[int | None, option("Count this step alone.", SHOWN, min=1, metavar="K")] = None,
     agent: Annotated[

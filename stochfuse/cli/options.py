@@ -143,7 +143,7 @@ def keys() -> Sequence[str]:
 OverOption = Annotated[
     list[str] | None,
     option(
-        "Rows are any number of the file: network.delay=0:3:1; once or twice.", SCENARIO, "--over", metavar="KEY=SPEC",
+        "Sweep any number: network.delay=0:3:1; once or twice.", SCENARIO, "--over", metavar="KEY=SPEC",
         autocompletion=completed(keys),
     ),
 ]  # fmt: skip
@@ -156,7 +156,7 @@ class Changes(NamedTuple):
     steps: Annotated[int | None, option("Number of time steps.", NETWORK, min=1, metavar="K")] = None
     link: Annotated[
         str | None,
-        option("Of all links: 0.5, 0.2,0.5 or 0:1:0.25 (both ends).", NETWORK, metavar="SPEC"),
+        option("Link probability: 0.5, 0.2,0.5 or 0:1:0.25 (both ends).", NETWORK, metavar="SPEC"),
     ] = None
     architecture: Annotated[
         str | None, choice(ARCHITECTURES, f"Who may hear whom: {', '.join(ARCHITECTURES)}.", NETWORK)
@@ -468,6 +468,8 @@ def over_values(texts: Sequence[str]) -> dict[str, list[float]]:
         if key in found:
             raise UsageError(f"--over: expected different keys, got {key} twice")
         found[key] = _numbers(f"--over {key}", spec)
+        if not all(map(isfinite, found[key])):
+            raise UsageError(f"--over {key}: expected finite numbers, got '{spec}'")
     return found
 
 
@@ -487,7 +489,7 @@ def over_ends(texts: Sequence[str]) -> tuple[str, tuple[float, float]]:
         low, high = map(_number, spec.split(":"))
     except ValueError:
         raise UsageError(f"--over: expected {expected}, got '{texts[0]}'") from None
-    if low >= high:
+    if not -inf < low < high < inf:
         raise UsageError(f"--over {key}: expected LO:HI with LO < HI, got '{spec}'")
     return key, (low, high)
 
@@ -520,15 +522,12 @@ def _number(text: str) -> float:
     try:
         return int(text)
     except ValueError:
-        number = float(text)
-    if not isfinite(number):
-        raise ValueError("not finite")
-    return number
+        return float(text)
 
 
 def _range(flag: str, text: str, ends: tuple[float, float, float], low: float, high: float) -> list[float]:
     first, last, step = ends
-    if not (step > 0 and last >= first and first >= low and last <= high):
+    if not (step > 0 and last >= first and first >= low and last <= high and isfinite(last - first)):
         bounds = f"{low:g} ≤ first ≤ last ≤ {high:g}" if isfinite(low) else "first ≤ last"
         raise UsageError(f"{flag}: expected first:last:step with {bounds} and step > 0, got '{text}'")
     count = (last - first) / step

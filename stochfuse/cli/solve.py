@@ -35,6 +35,7 @@ QUESTION = "Options"
 EXAMPLES = (
     "stochfuse solve --target 30 --method general",
     "stochfuse solve --target 25 --agents-needed --link 0.5",
+    "stochfuse solve --target 30 --over model.R=50:200 --link 0.5",
 )
 
 
@@ -45,11 +46,11 @@ class Asked(NamedTuple):
         float | None, option("Least link probability at which the value is at most X.", QUESTION, metavar="X")
     ] = None
     agents_needed: Annotated[
-        bool, option("With --target and --link: the least number of agents instead.", QUESTION, "--agents-needed")
+        bool, option("With --target, --link: the least number of agents.", QUESTION, "--agents-needed")
     ] = False
     over: Annotated[
         list[str] | None,
-        option("With --target: least or greatest value of that key instead.", QUESTION, "--over", metavar="KEY=LO:HI"),
+        option("With --target: least or greatest value of that key.", QUESTION, "--over", metavar="KEY=LO:HI"),
     ] = None
     sensitivity: Annotated[
         bool, option("What each link is worth, and which to improve first.", QUESTION, "--sensitivity")

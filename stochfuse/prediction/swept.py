@@ -185,8 +185,8 @@ class Swept(Result):
 
     def steady_values(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray | None:
         """Return a metric of the steady state, shape (rows,), or None if none was computed."""
-        found = self.each(lambda part: part.steady_values(of, agent))
-        return None if found[0] is None else np.concatenate(found)
+        found = [values for values in self.each(lambda part: part.steady_values(of, agent)) if values is not None]
+        return np.concatenate(found) if found else None
 
     def table(self, of: str | None = None, agent: int | str = "mean") -> str:
         """Return the table as text, as `stochfuse predict --over` prints it."""

@@ -21,11 +21,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
+from numbers import Real
 from typing import Any
 
 import numpy as np
 
 from stochfuse.errors import NoAnswerError, ScenarioError, UsageError
+from stochfuse.kalman.checks import shown
 from stochfuse.prediction.result import Prediction, Result
 from stochfuse.questions.question import SLACK, Question, check_target, described, question
 from stochfuse.scenario.over import over, unit_of, with_numbers
@@ -101,7 +103,7 @@ def least_value(
     >>> import stochfuse as sf
     >>> found = sf.least_value("thesis-transient", 30.0, "model.R", (50, 200), 0.5)
     >>> found.direction, round(found.at, 6)
-    ('greatest', 126.157606)
+    ('greatest', 122.799112)
     """
     check_target(target)
     unit, (low, high) = unit_of(key), _range(key, between)
@@ -142,14 +144,10 @@ def least_value(
 
 
 def _range(key: str, between: Sequence[float]) -> tuple[float, float]:
-    try:
-        low, high = between
-        fine = isfinite(low) and isfinite(high) and low < high
-    except (TypeError, ValueError):
-        fine = False
-    if not fine:
-        raise UsageError(f"over {key}: expected a least and a greatest value, LO:HI with LO < HI, got {between}")
-    return low, high
+    ends = tuple(between)
+    if len(ends) != 2 or not all(isinstance(end, Real) and isfinite(end) for end in ends) or ends[0] >= ends[1]:
+        raise UsageError(f"over {key}: expected a least and a greatest value, LO:HI with LO < HI, got {shown(between)}")
+    return ends
 
 
 @dataclass(frozen=True)

@@ -206,24 +206,27 @@ def value_sheet(found: LeastValue, digits: int = 5) -> SolutionSheet:
             for end, v in zip((low, high), ends, strict=True)
         ),
     ]
-    beside = None if found.beside is None else {"at": found.beside[0], "value": _finite_or_none(found.beside[1])}
+    beside = None if found.beside is None else {"over": found.beside[0], "value": _finite_or_none(found.beside[1])}
     facts = {
         "target": found.target,
         "link": float(found.prediction.link[0]),
-        "key": found.key,
-        "unit": found.unit or None,
-        "at": found.at,
-        "direction": found.direction,
-        "proof": found.proof,
+        "over": {
+            "key": found.key,
+            "unit": found.unit or None,
+            "value": found.at,
+            "direction": found.direction,
+            "proof": found.proof,
+        },
         "value": found.value,
         "between": [low, high],
         "met": [list(span) for span in found.met],
-        "certificate": {"proof": found.proof, "meets": {"at": found.at, "value": found.value}, "misses": beside},
-        "grid": [{"at": v, "value": _finite_or_none(e)} for v, e in found.grid.T.tolist()],
+        "certificate": {"meets": {"over": found.at, "value": found.value}, "misses": beside},
+        "grid": [{"over": v, "value": _finite_or_none(e)} for v, e in found.grid.T.tolist()],
     }
-    headings = ("step", "target", "link", "key", "key_unit", "at", "direction", "proof", "value", "misses_at")
+    title = f"{found.key} [{found.unit}]" if found.unit else found.key
+    headings = ("step", "target", "link", title, "direction", "proof", "value", "misses_at")
     record = (
-        *(_step(asked), found.target, float(found.prediction.link[0]), found.key, found.unit, found.at),
+        *(_step(asked), found.target, float(found.prediction.link[0]), found.at),
         *(found.direction, found.proof, found.value, _blank(None if found.beside is None else found.beside[0])),
     )
     return SolutionSheet(
