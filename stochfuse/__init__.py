@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from stochfuse.prediction.result import Prediction as Prediction
     from stochfuse.prediction.states import predict_states as predict_states
     from stochfuse.prediction.steady_state import steady_state as steady_state
+    from stochfuse.prediction.swept import Swept as Swept
     from stochfuse.questions.agents_needed import AgentsNeeded as AgentsNeeded
     from stochfuse.questions.agents_needed import agents_needed as agents_needed
     from stochfuse.questions.critical import Critical as Critical
@@ -40,6 +41,8 @@ if TYPE_CHECKING:
     from stochfuse.questions.crosscheck import check_results as check_results
     from stochfuse.questions.least_link import LeastLink as LeastLink
     from stochfuse.questions.least_link import least_link as least_link
+    from stochfuse.questions.least_value import LeastValue as LeastValue
+    from stochfuse.questions.least_value import least_value as least_value
     from stochfuse.questions.messages import MessageLoad as MessageLoad
     from stochfuse.questions.messages import message_load as message_load
     from stochfuse.questions.results import read_results as read_results
@@ -65,6 +68,7 @@ _HOME = {
     "Critical": "questions.critical",
     "FusionGraph": "estimators.fusion_graph",
     "LeastLink": "questions.least_link",
+    "LeastValue": "questions.least_value",
     "MessageLoad": "questions.messages",
     "NoAnswerError": "errors",
     "Prediction": "prediction.result",
@@ -72,6 +76,7 @@ _HOME = {
     "ScenarioError": "errors",
     "Sensitivity": "questions.sensitivity",
     "StochfuseError": "errors",
+    "Swept": "prediction.swept",
     "UsageError": "errors",
     "agents_needed": "questions.agents_needed",
     "check_results": "questions.crosscheck",
@@ -84,6 +89,7 @@ _HOME = {
     "from_networkx": "scenario.adapters",
     "from_stonesoup": "scenario.adapters",
     "least_link": "questions.least_link",
+    "least_value": "questions.least_value",
     "links": "scenario.known_links",
     "load_history": "estimators.fusion_graph",
     "load_scenario": "scenario.scenario",
@@ -104,6 +110,7 @@ __all__ = [
     "Critical",
     "FusionGraph",
     "LeastLink",
+    "LeastValue",
     "MessageLoad",
     "NoAnswerError",
     "Prediction",
@@ -111,6 +118,7 @@ __all__ = [
     "ScenarioError",
     "Sensitivity",
     "StochfuseError",
+    "Swept",
     "UsageError",
     "__version__",
     "agents_needed",
@@ -124,6 +132,7 @@ __all__ = [
     "from_networkx",
     "from_stonesoup",
     "least_link",
+    "least_value",
     "links",
     "load_history",
     "load_scenario",

@@ -16,6 +16,7 @@ from stochfuse.cli.options import (
     Changes,
     Graphs,
     MetricOption,
+    OverOption,
     Sampling,
     ScenarioArgument,
     Weighing,
@@ -46,6 +47,7 @@ EXAMPLES = (
 def compare(
     scenario: ScenarioArgument = "thesis-transient",
     changes: Changes = Changes(),
+    over: OverOption = None,
     methods: Annotated[
         str | None,
         option(
@@ -61,8 +63,8 @@ def compare(
     estimator: Annotated[
         str | None,
         option(
-            "Compare these estimators instead (stochfuse methods), what each claims beside what is true; all: those "
-            "that the scenario takes. One, with --methods: what these average.",
+            "Compare these estimators instead (stochfuse methods), claims beside truth; all: those that the scenario "
+            "takes. One, with --methods: what these average.",
             WORK,
             metavar="LIST",
             autocompletion=completed((*ESTIMATORS, ALL)),
@@ -95,7 +97,9 @@ def compare(
 
     to.check(scenario)
     given, links = changes.of(scenario)
-    check_memory(given, links, to.kind)
+    swept = changes.over(over, given)
+    given = swept.longest if swept else given
+    check_memory(given, links, to.kind, len(swept.points) if swept else 1)
     names = None if estimator is None else _names(estimator)
     if names is None and methods is None and given.estimator is not None:
         names = [ALL]  # a scenario for other estimators than those of the thesis' methods
@@ -111,6 +115,7 @@ def compare(
         **graphs._asdict(),
         **weighing._asdict(),
     )
+    settings |= {} if swept is None else {"over": swept}
     for flag, given_at_all in (("--reference", reference is not None), ("--relative", relative)):
         if several and given_at_all:
             raise UsageError(f"{flag}: expected methods to compare, got several estimators")

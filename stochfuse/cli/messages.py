@@ -13,6 +13,7 @@ from stochfuse.cli.options import (
     Changes,
     Graphs,
     MetricOption,
+    OverOption,
     Sampling,
     ScenarioArgument,
     Written,
@@ -25,7 +26,7 @@ from stochfuse.errors import UsageError
 from stochfuse.scenario.registry import GENERAL, LFG, MONTE_CARLO, NAIVE
 
 if TYPE_CHECKING:
-    from stochfuse.questions.messages import MessageLoad
+    from stochfuse.questions.messages import Load
 
 BOTH, EXACT = "both", "exact"
 EXAMPLES = (
@@ -42,7 +43,7 @@ class Shown(NamedTuple):
     ] = False
     cdf: Annotated[bool, option("Probabilities of at most so many nodes instead.", SHOWN, "--cdf")] = False
     accuracy: Annotated[
-        bool, option("Accuracy of the fused estimate beside the mean load instead.", SHOWN, "--accuracy")
+        bool, option("Accuracy of the fused estimate beside the load instead.", SHOWN, "--accuracy")
     ] = False
     metric: MetricOption = None
     quantity: Annotated[
@@ -59,11 +60,12 @@ class Shown(NamedTuple):
 def messages(
     scenario: ScenarioArgument = "thesis-transient",
     changes: Changes = Changes(),
+    over: OverOption = None,
     rule: Annotated[
         str, choice((LFG, NAIVE, BOTH), f"Whose messages: {LFG}, {NAIVE} or both; default: both.", SHOWN)
     ] = BOTH,
     from_step: Annotated[
-        int | None, option("First step counted; default: 1. The last one is --steps.", SHOWN, min=1, metavar="K")
+        int | None, option("First step counted; default: 1; the last: --steps.", SHOWN, min=1, metavar="K")
     ] = None,
     step: Annotated[int | None, option("Count this step alone.", SHOWN, min=1, metavar="K")] = None,
     agent: Annotated[
@@ -103,12 +105,14 @@ def messages(
     drawn = settings_for([method], **sampling._asdict())
     averaged = settings_for([GENERAL, NAIVE] if method == EXACT else [method], **graphs._asdict())
     given, links = changes.of(scenario)
-    check_memory(given, links, to.kind)
+    swept = changes.over(over, given)
+    given = swept.longest if swept else given
+    check_memory(given, links, to.kind, len(swept.points) if swept else 1)
     first, last = _window(given.network.steps, from_step, step)
     whose = int(agent) if agent.isdigit() else agent
     wanted = [each for each in RULES if rule in (each, BOTH)]
     of_rule = {
-        each: message_load(given, links, each, method=method, **drawn).between(first, last)
+        each: message_load(given, links, each, method=method, over=swept, **drawn).between(first, last)
         for each in {*wanted, NAIVE}  # naive loads are the numbers of messages
     }
     loads = tuple(of_rule[each] for each in wanted)
@@ -138,8 +142,8 @@ def _window(steps: int, from_step: int | None, step: int | None) -> tuple[int, i
     return (step, step) if step is not None else (from_step or 1, steps)
 
 
-def _note(loads: tuple[MessageLoad, ...], accuracies: tuple[Any, ...]) -> None:
-    if any(each.sample is not None for each in loads):
+def _note(loads: tuple[Load, ...], accuracies: tuple[Any, ...]) -> None:
+    if any(each.runs is not None for each in loads):
         typer.echo("note: the maximum of a sample is no bound; larger loads may be possible", err=True)
     for each in accuracies:
         for note in each.prediction.notes:

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import wraps
+from math import floor, inf, isfinite, log10
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_type_hints
 
@@ -23,6 +24,7 @@ from stochfuse.scenario.registry import CRITERIA, ESTIMATORS, GENERAL, METHODS, 
 
 if TYPE_CHECKING:
     from stochfuse.report.table import Report
+    from stochfuse.scenario.over import Over
     from stochfuse.scenario.scenario import Scenario
 
 MOST_LINKS = 1_000_000
@@ -131,6 +133,22 @@ MethodOption = Annotated[
 AtOption = Annotated[str | None, option("Only these steps: 1,5,10,last; default: all.", SHOWN, metavar="STEPS")]
 
 
+def keys() -> Sequence[str]:
+    """Keys of a scenario, as --over takes them."""
+    from stochfuse.scenario.schema import ScenarioFile, key_paths
+
+    return [f"{path}=" for path in key_paths(ScenarioFile)]
+
+
+OverOption = Annotated[
+    list[str] | None,
+    option(
+        "Sweep any number: network.delay=0:3:1; once or twice.", SCENARIO, "--over", metavar="KEY=SPEC",
+        autocompletion=completed(keys),
+    ),
+]  # fmt: skip
+
+
 class Changes(NamedTuple):
     """What options change in a scenario."""
 
@@ -138,7 +156,7 @@ class Changes(NamedTuple):
     steps: Annotated[int | None, option("Number of time steps.", NETWORK, min=1, metavar="K")] = None
     link: Annotated[
         str | None,
-        option("Link probabilities of all links: 0.5, 0.2,0.5 or 0:1:0.25 (both ends).", NETWORK, metavar="SPEC"),
+        option("Link probability: 0.5, 0.2,0.5 or 0:1:0.25 (both ends).", NETWORK, metavar="SPEC"),
     ] = None
     architecture: Annotated[
         str | None, choice(ARCHITECTURES, f"Who may hear whom: {', '.join(ARCHITECTURES)}.", NETWORK)
@@ -158,7 +176,39 @@ class Changes(NamedTuple):
         changed.pop("link")
         return load_scenario(scenario, **changed, uniform_link=links is not None), links
 
+    def over(self, texts: Sequence[str] | None, scenario: Scenario) -> Over | None:
+        """Return the scenarios that --over makes of one; None without.
 
+        Raises
+        ------
+        UsageError
+            If an option sets what is swept, or the option is malformed.
+        """
+        if not texts:
+            return None
+        from stochfuse.scenario import over
+
+        given = over_values(texts)
+        self.check_unset(given)
+        return over.over(scenario, given)
+
+    def check_unset(self, keys: Iterable[str]) -> None:
+        """Raise UsageError if an option sets one of some keys."""
+        for key in keys:
+            flag = next((flag for flag, place in PLACES.items() if place == key), None)
+            if flag is not None and getattr(self, flag) is not None:
+                raise UsageError(f"--over {key}: expected without --{flag}, which sets the same")
+
+
+PLACES = {
+    "agents": "network.agents",
+    "steps": "network.steps",
+    "link": "network.link",
+    "q": "model.Q",
+    "r": "model.R",
+    "p0": "initial.P",
+}
+"""Keys that options of `Changes` set."""
 MaxGraphsOption = Annotated[
     int | None, option("general: graphs carried from step to step; default: 100000.", WORK + RARE, min=1, metavar="N")
 ]
@@ -356,11 +406,11 @@ BYTES = {"table": 1000, "markdown": 1000, "latex": 1000, "csv": 200, "json": 200
 """Memory that a number takes on its way to the reader."""
 
 
-def check_memory(scenario: Scenario, links: Sequence[float] | None, kind: str) -> None:
+def check_memory(scenario: Scenario, links: Sequence[float] | None, kind: str, points: int = 1) -> None:
     """Raise UsageError, with an estimate, if the answer cannot be held in this machine's memory."""
     from stochfuse.scenario.scenario import link_rows
 
-    steps, rows = scenario.network.steps, len(link_rows(scenario, links).link)
+    steps, rows = scenario.network.steps, points * len(link_rows(scenario, links).link)
     needed = rows * steps * (BYTES[kind] + 24 * scenario.model.dimension**2)
     there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > there:
@@ -393,32 +443,103 @@ def parse_link(text: str) -> list[float]:
     UsageError
         If the text is none of these or a value is no probability.
     """
-    values: list[float] = []
-    for part in text.split(","):
-        try:
-            numbers = [float(piece) for piece in part.split(":")]
-        except ValueError:
-            numbers = []
-        if len(numbers) == 1:
-            values += numbers
-        elif len(numbers) == 3:
-            values += _range(text, *numbers)
-        else:
-            raise UsageError(f"--link: expected 0.5, 0.2,0.5 or 0:1:0.25, got '{text}'")
+    values = [float(value) for value in _numbers("--link", text, 0.0, 1.0)]
     for value in values:
         if not 0 <= value <= 1:
             raise UsageError(f"--link: expected probabilities between 0 and 1, got {value:g}")
     return values
 
 
-def _range(text: str, first: float, last: float, step: float) -> list[float]:
-    if not (step > 0 and last >= first and first >= 0 and last <= 1):
-        raise UsageError(f"--link: expected first:last:step with 0 ≤ first ≤ last ≤ 1 and step > 0, got '{text}'")
+def over_values(texts: Sequence[str]) -> dict[str, list[float]]:
+    """Return the values by key of `network.delay=0:3:1`, each as --link takes them, but any numbers.
+
+    Raises
+    ------
+    UsageError
+        If a text is malformed, there are more than two, or a key is named twice.
+    """
+    from stochfuse.scenario.over import MOST_KEYS
+
+    if len(texts) > MOST_KEYS:
+        raise UsageError(f"--over: expected it once or twice, got it {len(texts)} times; for more see stochfuse study")
+    found: dict[str, list[float]] = {}
+    for text in texts:
+        key, spec = _key_and(text, "KEY=SPEC such as network.delay=0:3:1 or model.R=50,100")
+        if key in found:
+            raise UsageError(f"--over: expected different keys, got {key} twice")
+        found[key] = _numbers(f"--over {key}", spec)
+        if not all(map(isfinite, found[key])):
+            raise UsageError(f"--over {key}: expected finite numbers, got '{spec}'")
+    return found
+
+
+def over_ends(texts: Sequence[str]) -> tuple[str, tuple[float, float]]:
+    """Return the key and the ends of `network.delay=0:10`.
+
+    Raises
+    ------
+    UsageError
+        If the text is malformed, or there are several.
+    """
+    if len(texts) > 1:
+        raise UsageError(f"--over: expected it once with --target, got it {len(texts)} times")
+    expected = "KEY=LO:HI such as model.R=50:200"
+    key, spec = _key_and(texts[0], expected)
+    try:
+        low, high = map(_number, spec.split(":"))
+    except ValueError:
+        raise UsageError(f"--over: expected {expected}, got '{texts[0]}'") from None
+    if not -inf < low < high < inf:
+        raise UsageError(f"--over {key}: expected LO:HI with LO < HI, got '{spec}'")
+    return key, (low, high)
+
+
+def _key_and(text: str, expected: str) -> tuple[str, str]:
+    key, _, spec = (part.strip() for part in text.partition("="))
+    if not key or not spec:
+        raise UsageError(f"--over: expected {expected}, got '{text}'")
+    return key, spec
+
+
+def _numbers(flag: str, text: str, low: float = -inf, high: float = inf) -> list[float]:
+    """Numbers of `0.5`, `0.2,0.5` or `0:1:0.25` (both ends included); whole where all that is written is whole."""
+    values: list[float] = []
+    for part in text.split(","):
+        try:
+            numbers = [_number(piece) for piece in part.split(":")]
+        except ValueError:
+            numbers = []
+        if len(numbers) == 1:
+            values += numbers
+        elif len(numbers) == 3:
+            values += _range(flag, text, (numbers[0], numbers[1], numbers[2]), low, high)
+        else:
+            raise UsageError(f"{flag}: expected 0.5, 0.2,0.5 or 0:1:0.25, got '{text}'")
+    return values
+
+
+def _number(text: str) -> float:
+    try:
+        return int(text)
+    except ValueError:
+        return float(text)
+
+
+def _range(flag: str, text: str, ends: tuple[float, float, float], low: float, high: float) -> list[float]:
+    first, last, step = ends
+    if not (step > 0 and last >= first and first >= low and last <= high and isfinite(last - first)):
+        bounds = f"{low:g} ≤ first ≤ last ≤ {high:g}" if isfinite(low) else "first ≤ last"
+        raise UsageError(f"{flag}: expected first:last:step with {bounds} and step > 0, got '{text}'")
     count = (last - first) / step
     if count > MOST_LINKS:
-        raise UsageError(f"--link: expected at most {MOST_LINKS} link probabilities, got {count:.3g} from '{text}'")
-    values = [round(first + i * step, 12) for i in range(int(count + 1e-9) + 1)]
-    return values if values[-1] >= last - 1e-12 else [*values, last]
+        what = "link probabilities" if flag == "--link" else "values"
+        raise UsageError(f"{flag}: expected at most {MOST_LINKS} {what}, got {count:.3g} from '{text}'")
+    if all(isinstance(number, int) for number in ends):
+        return [*range(int(first), int(last), int(step)), last]
+    # twelve digits of the largest, so that 0.3 is called 0.3
+    decimals = 12 - floor(log10(max(abs(first), abs(last), step)))
+    values = [round(first + i * step, decimals) for i in range(int(count + 1e-9) + 1)]
+    return values if values[-1] >= last - 0.1**decimals else [*values, last]
 
 
 def write_report(report: Report, kind: str, output: Path | None) -> None:

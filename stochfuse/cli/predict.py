@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stochfuse.cli.options import (
+    PLACES,
     RARE,
     SHOWN,
     AgentOption,
@@ -16,6 +17,7 @@ from stochfuse.cli.options import (
     Graphs,
     MethodOption,
     MetricOption,
+    OverOption,
     QuantityOption,
     Sampling,
     ScenarioArgument,
@@ -37,12 +39,14 @@ if TYPE_CHECKING:
 EXAMPLES = (
     "stochfuse predict --agents 50 --link 0:1:0.25 --steps 4",
     "stochfuse predict --method general --quantity claimed,actual --link 0.5",
+    "stochfuse predict --over model.R=50:200:25 --link 0.5",
 )
 
 
 def predict(
     scenario: ScenarioArgument = "thesis-transient",
     changes: Changes = Changes(),
+    over: OverOption = None,
     quantity: QuantityOption = "claimed",
     metric: MetricOption = None,
     statistic: Annotated[
@@ -78,7 +82,9 @@ def predict(
     to.check(scenario)
     quantities = quantity_names(quantity)
     given, links = changes.of(scenario)
-    check_memory(given, links, to.kind)
+    swept = changes.over(over, given)
+    given = swept.longest if swept else given
+    check_memory(given, links, to.kind, len(swept.points) if swept else 1)
     chosen_agent, steps = whose(agent, given), steps_at(at, given)
     chosen = metric_of(metric or given.metric or "trace", given.model)
     for name in quantities:
@@ -96,7 +102,11 @@ def predict(
         for name in quantities:
             check_statistic(statistic, name, chosen)
     given_settings = {"estimator": estimator, **sampling._asdict(), **graphs._asdict(), **weighing._asdict()}
-    settings = {"steady": steady, **settings_for([way], **given_settings)}
+    settings = {"steady": steady, "over": swept, **settings_for([way], **given_settings)}
+    if swept and statistic != "mean":
+        settings["one_by_one"] = True  # whose outcomes are kept
+    if normalise and swept and any(key.name == PLACES["link"] for key in swept.keys):
+        raise UsageError("--normalise: expected without --over network.link, since it is to link probability 0")
     asked = None if free else way
     found = run(given, links, asked, quantities, **settings)
     at_zero = run(given, [0.0], asked, quantities, **settings) if normalise else [None] * len(found)
@@ -112,7 +122,7 @@ def predict(
 
 def _warn(views: tuple[PredictionView, ...]) -> None:
     first = views[0]
-    if first.prediction.sampled is not None and first.agent in ("worst", "best") and not first.prediction.alike:
+    if first.sampled and first.agent in ("worst", "best") and not first.prediction.alike:
         typer.echo(
             f"note: which agent is the {first.agent} is judged by the same sample: the value is biased", err=True
         )

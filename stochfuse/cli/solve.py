@@ -20,6 +20,7 @@ from stochfuse.cli.options import (
     check_memory,
     choice,
     option,
+    over_ends,
     settings_for,
     whose,
 )
@@ -35,9 +36,10 @@ QUESTION = "Options"
 EXAMPLES = (
     "stochfuse solve --target 30 --method general",
     "stochfuse solve --target 25 --agents-needed --link 0.5",
+    "stochfuse solve --target 30 --over model.R=50:200 --link 0.5",
 )
 
-NOT_CRITICAL = ("target", "agents-needed", "sensitivity", "gain", "steady")
+NOT_CRITICAL = ("target", "agents-needed", "sensitivity", "gain", "steady", "over")
 """Questions about a number, which has a step and a metric; whether it is bounded is the same in all of them."""
 
 
@@ -50,6 +52,10 @@ class Asked(NamedTuple):
     agents_needed: Annotated[
         bool, option("With --target, --link: the least number of agents.", QUESTION, "--agents-needed")
     ] = False
+    over: Annotated[
+        list[str] | None,
+        option("That key for µ: with --target KEY=LO:HI, with --critical KEY.", QUESTION, "--over", metavar="KEY"),
+    ] = None
     sensitivity: Annotated[
         bool, option("What each link is worth, and which to improve first.", QUESTION, "--sensitivity")
     ] = False
@@ -60,7 +66,6 @@ class Asked(NamedTuple):
         bool,
         option("Ask about the steady state; alone: tabulate it over --link.", QUESTION, "--steady"),
     ] = False
-
     critical: Annotated[
         bool,
         option("The µ above which the average stays bounded, proved.", QUESTION, "--critical"),
@@ -77,6 +82,7 @@ class Asked(NamedTuple):
         """
         return _question(
             self.target,
+            over=bool(self.over),
             agents_needed=self.agents_needed,
             sensitivity=self.sensitivity,
             gain=self.gain,
@@ -120,10 +126,10 @@ def solve(
     to.check(scenario)
     kind = asked_for.kind
     for flag, value, wanted in (
-        ("--link", changes.link, ("agents-needed", "sensitivity", "gain", "steady")),
+        ("--link", changes.link, ("agents-needed", "sensitivity", "gain", "steady", "over")),
         ("--case", case, ("sensitivity",)),
         ("--max-agents", max_agents, ("agents-needed",)),
-        ("--agents", changes.agents, ("target", "sensitivity", "gain", "steady", "critical")),
+        ("--agents", changes.agents, ("target", "sensitivity", "gain", "steady", "over", "critical")),
         ("--step", step, NOT_CRITICAL),
         ("--metric", metric, NOT_CRITICAL),
         ("--estimator", estimator, NOT_CRITICAL),
@@ -134,7 +140,7 @@ def solve(
         if value is not None and kind not in wanted:
             raise UsageError(f"{flag}: expected with --{', --'.join(wanted)}; got it with --{kind}")
     if kind == "critical":
-        to.write(_critical(changes.of(scenario)[0], agent))
+        to.write(_critical(changes.of(scenario)[0], agent, asked_for.over))
         return
     asked: dict[str, Any] = {
         "step": step,
@@ -147,25 +153,51 @@ def solve(
     given, links = changes.of(scenario)
     check_memory(given, links, to.kind)
     asked["agent"] = whose(agent, given)
+    if asked_for.over:
+        key, between = over_ends(asked_for.over)
+        changes.check_unset([key])
+        asked |= {"key": key, "between": between}
     sheet, found = _answer(kind, given, links, asked_for.target, case, max_agents, to.digits, asked)
     _note(sheet)
     to.write(solutions.solution_report(sheet, found))
 
 
-def _critical(given: Scenario, agent: str | None) -> Report:
+def _critical(given: Scenario, agent: str | None, over: list[str] | None) -> Report:
     from stochfuse.questions.critical import critical
     from stochfuse.report.critical import critical_report
+    from stochfuse.scenario.over import unit_of, with_numbers
 
-    return critical_report(critical(given, agent=whose(agent, given)))
+    if not over:
+        return critical_report(critical(given, agent=whose(agent, given)))
+    key = over[0].strip()
+    if len(over) > 1 or "=" in key:
+        raise UsageError(f"--over: expected one KEY without values with --critical, got '{' '.join(over)}'")
+    unit_of(key)  # says which key was meant, if it is none
+    found = critical(given, lambda x: with_numbers(given, {key: x}), agent=whose(agent, given), name=key)
+    return critical_report(found)
 
 
 def _question(
-    target: float | None, *, agents_needed: bool, sensitivity: bool, gain: bool, steady: bool, critical: bool
+    target: float | None,
+    *,
+    over: bool,
+    agents_needed: bool,
+    sensitivity: bool,
+    gain: bool,
+    steady: bool,
+    critical: bool,
 ) -> str:
     questions = {"target": target is not None, "sensitivity": sensitivity, "gain": gain, "critical": critical}
     chosen = [name for name, wanted in questions.items() if wanted]
     if len(chosen) > 1:
         raise UsageError(f"expected one question a call, got --{' and --'.join(chosen)}")
+    if over and chosen == ["critical"]:
+        return "critical"
+    if over and (chosen != ["target"] or agents_needed):
+        got = "--agents-needed" if agents_needed else f"--{chosen[0]}" if chosen else "no --target"
+        raise UsageError(f"--over: expected --target X or --critical with it, got {got}")
+    if over:
+        return "over"
     if agents_needed:
         if chosen != ["target"]:
             raise UsageError("--agents-needed: expected --target X and --link P with it, got no --target")
@@ -188,13 +220,17 @@ def _answer(
     digits: int,
     asked: dict[str, Any],
 ) -> tuple[SolutionSheet, Any]:
-    from stochfuse.questions import agents_needed, least_link, sensitivity
+    from stochfuse.questions import agents_needed, least_link, least_value, sensitivity
     from stochfuse.questions.question import question
     from stochfuse.report import solutions
 
     if kind == "target":
         found = least_link.least_link(given, target or 0.0, **asked)
         return solutions.least_link_sheet(found, digits), found
+    if kind == "over":
+        at = None if links is None else _single(links, kind)
+        found = least_value.least_value(given, target or 0.0, link=at, **asked)
+        return solutions.value_sheet(found, digits), found
     if kind == "agents-needed":
         found = agents_needed.agents_needed(given, target or 0.0, _single(links, kind), max_agents=max_agents, **asked)
         return solutions.agents_sheet(found, digits), found

@@ -50,3 +50,22 @@ def listening(progress: Progress) -> Iterator[None]:
         yield
     finally:
         _LISTENER.reset(token)
+
+
+class _Within(Progress):
+    def __init__(self, outer: Progress, name: str, number: int, of: int) -> None:
+        self._outer, self._name, self._share = outer, f"{name} ({number} of {of})", (number - 1, of)
+        outer.advance(self._name, *self._share)
+
+    def expect(self, outcomes: int, graphs: int) -> None:
+        self._outer.expect(outcomes, graphs)
+
+    def advance(self, what: str, done: int, total: int) -> None:
+        self._outer.advance(f"{self._name}: {what}", done, total)
+
+
+@contextmanager
+def within(name: str, number: int, of: int) -> Iterator[None]:
+    """Let whoever listens hear which of several pieces of work it is that the work inside tells of."""
+    with listening(_Within(listener(), name, number, of)):
+        yield

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import log2
 from typing import Any
@@ -15,6 +15,9 @@ from stochfuse.kalman.metrics import Metric
 from stochfuse.prediction.predict import choose, predict
 from stochfuse.prediction.quantities import QUANTITIES
 from stochfuse.prediction.result import Prediction
+from stochfuse.prediction.swept import Swept
+from stochfuse.scenario.over import Over
+from stochfuse.scenario.over import over as read_over
 from stochfuse.scenario.registry import CHAIN, ESTIMATORS, GENERAL, METHODS, MONTE_CARLO, NAIVE, OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.result import Result
 from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario
@@ -33,10 +36,10 @@ class Comparison(Result):
     predictions : one per method, the reference first.
     """
 
-    predictions: tuple[Prediction, ...]
+    predictions: tuple[Prediction | Swept, ...]
 
     @property
-    def reference(self) -> Prediction:
+    def reference(self) -> Prediction | Swept:
         """Return what the others are compared with."""
         return self.predictions[0]
 
@@ -62,6 +65,8 @@ def compare(
     methods: Sequence[str] = DEFAULT_METHODS,
     reference: str | None = None,
     quantity: str = "claimed",
+    *,
+    over: Mapping[str, Any] | Over | None = None,
     **settings: Any,
 ) -> Comparison:
     """Predict by several methods.
@@ -72,6 +77,7 @@ def compare(
     methods : at least one of `METHODS`.
     reference : the method that the others are compared with; default: general if it is among them, else the most exact.
     quantity : what is compared, as for `predict`.
+    over : values of one or two numbers of the scenario by their paths, as for `predict`: the rows.
     **settings : as for `predict`.
 
     Returns
@@ -105,11 +111,13 @@ def compare(
     elif reference not in methods:
         raise UsageError(f"reference: expected one of the methods compared ({', '.join(methods)}), got '{reference}'")
     ordered = [reference, *(m for m in methods if m != reference)]
+    if over is not None:
+        settings["over"] = read_over(scenario, over)
     settings = {"quantity": quantity, **settings}
     return Comparison(tuple(_predict(scenario, link, method, settings) for method in ordered))
 
 
-def _predict(scenario: Scenario, link: Any, method: str, settings: dict[str, Any]) -> Prediction:
+def _predict(scenario: Scenario, link: Any, method: str, settings: dict[str, Any]) -> Prediction | Swept:
     try:
         return predict(scenario, link, method, **settings)
     except UsageError as error:
@@ -131,7 +139,7 @@ class EstimatorComparison(Result):
     left_out : estimators that were not asked for by name and cannot be had here, with the reason.
     """
 
-    predictions: tuple[Prediction, ...]
+    predictions: tuple[Prediction | Swept, ...]
     left_out: tuple[str, ...] = ()
 
     @property
@@ -152,6 +160,7 @@ def compare_estimators(
     method: str | None = None,
     *,
     quantities: Sequence[str] = SIDE_BY_SIDE,
+    over: Mapping[str, Any] | Over | None = None,
     **settings: Any,
 ) -> EstimatorComparison:
     """Predict what several estimators claim and what their errors truly are, on the same lossy network.
@@ -162,6 +171,7 @@ def compare_estimators(
     estimators : names out of `stochfuse.prediction.predict.ESTIMATORS`; default: all that the scenario takes.
     method : "general" or "monte-carlo"; default: exact where up to `EASY` graphs (or `max_graphs`) have to be carried
         and no runs are asked for, else sampled, with the same arrivals for all estimators.
+    over : values of one or two numbers of the scenario by their paths, as for `predict`: the rows.
     quantities : what is to be compared; bias and rms make a note of an initial error that is not known.
     **settings : as for `predict`.
 
@@ -186,7 +196,9 @@ def compare_estimators(
     for quantity in quantities:
         choose("quantity", quantity, tuple(q for q in QUANTITIES if q != OPTIMAL))
     hardest = max(quantities, key=("claimed", "actual", "consistency", "bias", "rms").index)
-    found: list[Prediction] = []
+    if over is not None:
+        settings["over"] = read_over(scenario, over)
+    found: list[Prediction | Swept] = []
     left_out: dict[str, list[str]] = {}
     for name in estimators or ESTIMATORS:
         try:
@@ -203,15 +215,21 @@ def compare_estimators(
 
 def _estimated(
     scenario: Scenario, link: Any, estimator: str, method: str | None, quantity: str, settings: dict[str, Any]
-) -> Prediction:
+) -> Prediction | Swept:
     if method is not None:
         return predict(scenario, link, method, quantity, estimator=estimator, **settings)
     easy = {"max_graphs": EASY, **settings}
-    network = scenario.network
-    exchange = len(events(network, link_rows(scenario, link), 1)) * log2(len(network.delay) + 1)
+    every = settings["over"].scenarios if "over" in settings else (scenario,)
+    exchange = max(_exchange(some, link) for some in every)
     if {"runs", "seed", "workers"} & set(settings) or exchange > EASY_EXCHANGE:
         return predict(scenario, link, MONTE_CARLO, quantity, estimator=estimator, **settings)
     try:
         return predict(scenario, link, GENERAL, quantity, estimator=estimator, **easy)
     except TooManyError:
         return predict(scenario, link, MONTE_CARLO, quantity, estimator=estimator, **settings)
+
+
+def _exchange(scenario: Scenario, link: Any) -> float:
+    """Binary logarithm of the outcomes of one exchange."""
+    network = scenario.network
+    return len(events(network, link_rows(scenario, link), 1)) * log2(len(network.delay) + 1)

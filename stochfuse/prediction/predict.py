@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -22,8 +22,11 @@ from stochfuse.kalman.checks import covariance_fault
 from stochfuse.prediction.method import RUNS, Averaged, Settings, faults_of
 from stochfuse.prediction.quantities import QUANTITIES
 from stochfuse.prediction.result import Prediction
+from stochfuse.prediction.swept import Swept, of_parts
 from stochfuse.scenario import capabilities, registry
 from stochfuse.scenario.network import LinkRows
+from stochfuse.scenario.over import Over
+from stochfuse.scenario.over import over as read_over
 from stochfuse.scenario.registry import (
     CRITERIA,
     ESTIMATORS,
@@ -37,7 +40,7 @@ from stochfuse.scenario.registry import (
     SIMPLIFIED,
 )
 from stochfuse.scenario.result import Result
-from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario
+from stochfuse.scenario.scenario import Scenario, ScenarioLike, link_rows, of_scenario
 from stochfuse.scenario.system import Items, Noises, System
 
 if TYPE_CHECKING:
@@ -55,17 +58,45 @@ WORTHLESS = 1e-3
 """Relative rounding beyond which it is no answer."""
 
 
-@of_scenario
+Links = Sequence[float] | np.ndarray | float | LinkRows | None
+
+
+@overload
 def predict(
-    scenario: Scenario,
-    link: Sequence[float] | np.ndarray | float | LinkRows | None = None,
+    scenario: ScenarioLike,
+    link: Links = None,
     method: str | None = None,
     quantity: str = "claimed",
     *,
     steady: bool = False,
     interval: float | str | None = None,
+    interval: float | str | None = None,
+    over: None = None,
     **settings: Any,
-) -> Prediction:
+) -> Prediction: ...
+@overload
+def predict(
+    scenario: ScenarioLike,
+    link: Links = None,
+    method: str | None = None,
+    quantity: str = "claimed",
+    *,
+    steady: bool = False,
+    over: Mapping[str, Any] | Over,
+    **settings: Any,
+) -> Swept: ...
+@of_scenario
+def predict(
+    scenario: Scenario,
+    link: Links = None,
+    method: str | None = None,
+    quantity: str = "claimed",
+    *,
+    steady: bool = False,
+    interval: float | str | None = None,
+    over: Mapping[str, Any] | Over | None = None,
+    **settings: Any,
+) -> Prediction | Swept:
     """Predict the expected fused covariance against link probability.
 
     Parameters
@@ -89,11 +120,14 @@ def predict(
     steady : also solve for the steady state (simplified).
     interval : a probability (0.95, "95%"): also what the log behind the scenario's links leaves unknown, see
         `Prediction.interval`.
+    over : values of one or two numbers of the scenario by their paths, {"network.delay": [0, 1, 2]}: what is
+        predicted, at the same links, of every combination.
     **settings : see `Settings`.
 
     Returns
     -------
     Prediction
+        With `over` a `Swept`: rows are the values (and links), and errors name the value.
 
     Raises
     ------
@@ -108,7 +142,13 @@ def predict(
     >>> p = sf.predict("thesis-transient", [0, 0.5])
     >>> p.values().round(3)[:, -1]
     array([39.775, 26.271])
+    >>> sf.predict("thesis-transient", [0.5], over={"model.R": [50, 100]}).values().round(3)[:, -1]
+    array([17.191, 26.271])
     """
+    if over is not None:
+        if interval is not None:
+            raise UsageError("interval: expected one scenario, got values of a key (over)")
+        return predict_several(scenario, link, method, [quantity], over=over, steady=steady, **settings)[0]
     if (
         method is None
         and scenario.method is None
@@ -152,9 +192,20 @@ def predict_several(
     link: Sequence[float] | np.ndarray | float | LinkRows | None,
     method: str | None,
     quantities: Sequence[str],
+    *,
+    over: Mapping[str, Any] | Over | None = None,
+    one_by_one: bool = False,
     **settings: Any,
-) -> list[Prediction]:
-    """Predict several quantities, with no more work than the hardest of them needs; see `predict`."""
+) -> list[Any]:
+    """Predict several quantities, with no more work than the hardest of them needs; see `predict`.
+
+    Parameters
+    ----------
+    one_by_one : predict every point of `over` by itself even where all could be predicted together, which leaves no
+        outcomes to take statistics of.
+    """
+    if over is not None:
+        return _swept(read_over(scenario, over), link, method, quantities, one_by_one, settings)
     method = registry.OPTIMAL if method == registry.CHAIN else method or scenario.method
     if method is None and settings.get("estimator") is None:
         method = registry.SIMPLIFIED
@@ -170,6 +221,37 @@ def predict_several(
             common = predict(scenario, link, method, hardest, **settings)
             found |= {q: common if q == hardest else common.shown_as(q) for q in some}
     return [found[q] for q in quantities]
+
+
+def _swept(
+    over: Over, link: Any, method: str | None, quantities: Sequence[str], one_by_one: bool, settings: Mapping[str, Any]
+) -> list[Swept]:
+    over.check(link)
+    together = None if one_by_one else _at_once(over, link, method, quantities, settings)
+    if together is not None:
+        return [Swept(over, (p,)) for p in together]
+    found = of_parts(over, over.scenarios, lambda some: predict_several(some, link, method, quantities, **settings))
+    return [Swept(over, parts) for parts in zip(*found, strict=True)]
+
+
+def _at_once(
+    over: Over, link: Any, method: str | None, quantities: Sequence[str], settings: Mapping[str, Any]
+) -> list[Prediction] | None:
+    """Predict all points as items of one system; None where that cannot be, or has an error to be found one by one."""
+    first = over.scenarios[0]
+    way = method or first.method or (registry.SIMPLIFIED if settings.get("estimator") is None else None)
+    # the answer to a sample depends on the company it is drawn in
+    if way in (None, MONTE_CARLO) or settings.get("prune") or settings.get("steady"):
+        return None
+    items = over.items(link)
+    if items is None or len(over.scenarios) == 1:
+        return None
+    given = {name: value for name, value in settings.items() if name != "steady"}
+    try:
+        found = predict_items(first, items, way, quantities, **given)
+    except StochfuseError:
+        return None
+    return None if found.faults else found.predictions
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -87,6 +87,11 @@ class Prediction(Result):
         """Whether all agents have the same covariance."""
         return self.by_group.shape[2] == 1
 
+    @property
+    def with_actual(self) -> bool:
+        """Whether the moments of the actual error are known."""
+        return self.moments.actual is not None
+
     def of_agent(self, agent: int | str = "mean") -> np.ndarray:
         """The same of one agent (numbered from 1) or averaged over all, shape (links, steps, d, d)."""
         return self._select(self.by_group, agent)

@@ -1,6 +1,7 @@
 """Questions asked of predictions: backwards, of links, of messages, of a simulator.
 
     least_link, agents_needed      which µ, or how many agents, meet a target
+    least_value                    which value of any key does
     critical                       the µ above which (54) stays bounded
     sensitivity                    what a better link is worth
     messages, message_chain        how much the agents have to send each other

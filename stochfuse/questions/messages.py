@@ -16,9 +16,9 @@ and step).  The links to its parents, some n bits, are not counted.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 
@@ -26,11 +26,14 @@ from stochfuse.engines.events import events
 from stochfuse.errors import UsageError
 from stochfuse.prediction.method import RUNS, SEED
 from stochfuse.prediction.predict import choose, predict
+from stochfuse.prediction.swept import Swept, below_each_other, of_parts
 from stochfuse.questions.message_chain import frequencies, like_agents, naive_load, sampled_loads, walked_load
 from stochfuse.scenario.network import LinkRows, require_memoryless
+from stochfuse.scenario.over import Over
+from stochfuse.scenario.over import over as read_over
 from stochfuse.scenario.registry import GENERAL, LFG, MONTE_CARLO, NAIVE
 from stochfuse.scenario.result import Result
-from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario, require_one_state
+from stochfuse.scenario.scenario import Scenario, ScenarioLike, link_rows, of_scenario, require_one_state
 
 RULES = (LFG, NAIVE)
 METHODS = ("exact", MONTE_CARLO)
@@ -132,6 +135,16 @@ class MessageLoad(Result):
         runs = self.sample[..., self._agents(agent)].mean(axis=(2, 3))
         return runs.std(axis=1, ddof=1) / np.sqrt(runs.shape[1])
 
+    @property
+    def runs(self) -> int | None:
+        """Runs of the sample, if sampled."""
+        return None if self.sample is None else self.sample.shape[1]
+
+    @property
+    def alike(self) -> bool:
+        """Whether all agents have the same load."""
+        return self.probabilities.shape[2] == 1
+
     def _agents(self, agent: int | str) -> list[int]:
         n = len(self.group_of)
         if agent == "mean":
@@ -141,6 +154,139 @@ class MessageLoad(Result):
         raise UsageError(f"agent: expected mean or a number from 1 to {n}, got '{agent}'")
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class SweptLoad(Result):
+    """Message loads against the values of one or two keys of the scenario; rows are theirs, links running fastest.
+
+    Parameters
+    ----------
+    over : the keys and their values, and the scenario of every point.
+    parts : loads of the points, in order.
+    """
+
+    over: Over
+    parts: tuple[MessageLoad, ...]
+
+    @property
+    def point(self) -> np.ndarray:
+        """(rows,) index of each row's point."""
+        return np.repeat(np.arange(len(self.parts)), [len(part.link) for part in self.parts])
+
+    @property
+    def link(self) -> np.ndarray:
+        """(rows,) link probability of each row, averaged over the links if they differ."""
+        return np.concatenate([part.link for part in self.parts])
+
+    @property
+    def cases(self) -> tuple[str, ...] | None:
+        """A name per row where rows are cases."""
+        if self.parts[0].cases is None:
+            return None
+        return tuple(name for part in self.parts for name in part.cases or ())
+
+    @property
+    def scenario(self) -> Scenario:
+        """The first point's scenario."""
+        return self.over.scenarios[0]
+
+    @property
+    def rule(self) -> str:
+        """Whose messages."""
+        return self.parts[0].rule
+
+    @property
+    def nature(self) -> str:
+        """How certain: "exact" or "sampled"."""
+        return self.parts[0].nature
+
+    @property
+    def runs(self) -> int | None:
+        """Runs of the sample, if sampled."""
+        return self.parts[0].runs
+
+    @property
+    def seed(self) -> int | None:
+        """Seed of the sample, if sampled."""
+        return self.parts[0].seed
+
+    @property
+    def steps(self) -> np.ndarray:
+        """Steps of the window, of the point that has most of them."""
+        return max((part.steps for part in self.parts), key=len)
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """Loads that distributions list: 0, 1, 2 …"""
+        return max((part.sizes for part in self.parts), key=len)
+
+    @property
+    def alike(self) -> bool:
+        """Whether all agents have the same load at every point."""
+        return all(part.alike for part in self.parts)
+
+    def between(self, first: int, last: int) -> SweptLoad:
+        """Return the same for steps first … last, of points with fewer up to their last."""
+        parts = of_parts(self.over, self.parts, lambda part: part.between(first, min(last, int(part.steps[-1]))))
+        return replace(self, parts=tuple(parts))
+
+    def by_step(self, agent: int | str = "mean") -> np.ndarray:
+        """Probabilities of each size at each step, (rows, steps, sizes), 0 at steps that a point does not have."""
+        return self._read(lambda part: part.by_step(agent), 0.0)
+
+    def distribution(self, agent: int | str = "mean") -> np.ndarray:
+        """Probabilities of each size at a step of the window picked at random, (rows, sizes)."""
+        return self._read(lambda part: part.distribution(agent), 0.0)
+
+    def cdf(self, agent: int | str = "mean") -> np.ndarray:
+        """Probability that the load is at most each size, (rows, sizes)."""
+        return self._read(lambda part: part.cdf(agent), 1.0)
+
+    def mean(self, agent: int | str = "mean") -> np.ndarray:
+        """Mean load in nodes, (rows,)."""
+        return self._read(lambda part: part.mean(agent))
+
+    def std(self, agent: int | str = "mean") -> np.ndarray:
+        """Standard deviation of the load in nodes, (rows,)."""
+        return self._read(lambda part: part.std(agent))
+
+    def maximum(self, agent: int | str = "mean") -> np.ndarray:
+        """Largest load that has a positive probability (or, if sampled, was drawn), (rows,)."""
+        return self._read(lambda part: part.maximum(agent))
+
+    def quantile(self, p: float, agent: int | str = "mean") -> np.ndarray:
+        """Smallest size that holds a share p of the loads, (rows,)."""
+        return self._read(lambda part: part.quantile(p, agent))
+
+    def standard_error(self, agent: int | str = "mean") -> np.ndarray | None:
+        """Return the standard error of the mean over independent runs, (rows,), or None if it is exact."""
+        return None if self.runs is None else self._read(lambda part: part.standard_error(agent))
+
+    def _read(self, read: Callable[[MessageLoad], Any], fill: float = np.nan) -> np.ndarray:
+        return below_each_other(of_parts(self.over, self.parts, read), fill)
+
+
+@overload
+def message_load(
+    scenario: ScenarioLike,
+    link: Sequence[float] | np.ndarray | float | LinkRows | None = None,
+    rule: str = LFG,
+    *,
+    method: str = "exact",
+    runs: int = RUNS,
+    seed: int = SEED,
+    over: None = None,
+) -> MessageLoad: ...
+@overload
+def message_load(
+    scenario: ScenarioLike,
+    link: Sequence[float] | np.ndarray | float | LinkRows | None = None,
+    rule: str = LFG,
+    *,
+    method: str = "exact",
+    runs: int = RUNS,
+    seed: int = SEED,
+    over: Mapping[str, Any] | Over,
+) -> SweptLoad: ...
 @of_scenario
 def message_load(
     scenario: Scenario,
@@ -150,7 +296,8 @@ def message_load(
     method: str = "exact",
     runs: int = RUNS,
     seed: int = SEED,
-) -> MessageLoad:
+    over: Mapping[str, Any] | Over | None = None,
+) -> MessageLoad | SweptLoad:
     """Distribution of the message load at every step of a scenario.
 
     Parameters
@@ -159,11 +306,12 @@ def message_load(
     rule : "local-fusion-graph": every node that is new to the receiver; "naive": the senders' latest nodes, (42)/(43).
     method : "exact"; or "monte-carlo", sampled, for networks with too many states (naive loads are always exact).
     runs, seed : of the sample.
+    over : values of one or two numbers of the scenario by their paths, as for `stochfuse.predict`.
 
     Returns
     -------
     MessageLoad
-        Over all steps; see `MessageLoad.between`.
+        Over all steps; see `MessageLoad.between`.  With `over` a `SweptLoad`.
 
     Raises
     ------
@@ -176,6 +324,15 @@ def message_load(
     >>> sf.message_load("thesis-transient", [0.5]).mean().round(4)
     array([1.6898])
     """
+    if over is not None:
+        found = read_over(scenario, over)
+        found.check(link)
+        loads = of_parts(
+            found,
+            found.scenarios,
+            lambda some: message_load(some, link, rule, method=method, runs=runs, seed=seed),
+        )
+        return SweptLoad(found, tuple(loads))
     choose("rule", rule, RULES)
     choose("method", method, METHODS)
     for name, value, least in (("runs", runs, 2), ("seed", seed, 0)):
@@ -209,6 +366,9 @@ def message_load(
     )
 
 
+Load = MessageLoad | SweptLoad
+
+
 class Bytes(NamedTuple):
     """Bytes that an agent receives in a step.
 
@@ -228,7 +388,7 @@ def node_bytes(dimension: int) -> int:
     return NUMBER_BYTES * (dimension + dimension * (dimension + 1) // 2) + IDENTITY_BYTES
 
 
-def in_bytes(load: MessageLoad, messages: MessageLoad, *, header: int = 0, agent: int | str = "mean") -> Bytes:
+def in_bytes(load: Load, messages: Load, *, header: int = 0, agent: int | str = "mean") -> Bytes:
     """Return a load in bytes.
 
     Parameters
@@ -244,6 +404,12 @@ def in_bytes(load: MessageLoad, messages: MessageLoad, *, header: int = 0, agent
     """
     if header < 0:
         raise UsageError(f"header: expected a number of bytes of at least 0, got {header}")
+    if isinstance(load, SweptLoad) and isinstance(messages, SweptLoad):
+        both = zip(load.parts, messages.parts, strict=True)
+        each = [in_bytes(own, number, header=header, agent=agent) for own, number in both]
+        return Bytes(each[0].node, *(np.concatenate(column) for column in list(zip(*each, strict=True))[1:]))
+    if isinstance(load, SweptLoad) or isinstance(messages, SweptLoad):
+        raise TypeError("loads of the same points are put together")
     node = node_bytes(load.scenario.model.dimension)
     # a step brings most nodes when all its messages arrive, so that both maxima are reached together
     most = [
@@ -264,14 +430,14 @@ class Accuracy(NamedTuple):
     error : (rows,) upper bound of its standard error, or None if nothing was sampled.
     """
 
-    load: MessageLoad
+    load: Load
     prediction: Any
     values: np.ndarray
     error: np.ndarray | None
 
 
 def accuracy(
-    load: MessageLoad,
+    load: Load,
     link: Any = None,
     *,
     metric: Any = "trace",
@@ -290,6 +456,13 @@ def accuracy(
     method : "exact": general formulation (49) of the rule; or "monte-carlo".
     **settings : of `stochfuse.predict`.
     """
+    if isinstance(load, SweptLoad):
+        asked = {"metric": metric, "quantity": quantity, "agent": agent, "method": method, **settings}
+        each = of_parts(load.over, load.parts, lambda part: accuracy(part, link, **asked))
+        errors = [one.error for one in each if one.error is not None]
+        error = np.concatenate(errors) if errors else None
+        predictions = Swept(load.over, tuple(one.prediction for one in each))
+        return Accuracy(load, predictions, np.concatenate([one.values for one in each]), error)
     scenario, last = load.scenario, int(load.steps[-1])
     if method == "exact":
         how = NAIVE if load.rule == NAIVE else GENERAL

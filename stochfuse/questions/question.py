@@ -19,6 +19,8 @@ from stochfuse.prediction.predict import choose
 from stochfuse.prediction.predict import predict as predict_
 from stochfuse.prediction.quantities import noun
 from stochfuse.prediction.result import Prediction
+from stochfuse.prediction.swept import Swept
+from stochfuse.scenario.over import Over
 from stochfuse.scenario.registry import CHAIN, METHODS, MONTE_CARLO, OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.scenario import Scenario
 
@@ -51,6 +53,11 @@ class Question:
         """Return the prediction at some links."""
         more = {"steady": True} if self.step is None else {}
         return predict_(self.scenario, link, self.method, self.quantity, **more, **self.settings)
+
+    def sweep(self, link: Any, over: Over) -> Swept:
+        """Return the predictions of what was swept at some links."""
+        more = {"steady": True} if self.step is None else {}
+        return predict_(self.scenario, link, self.method, self.quantity, over=over, **more, **self.settings)
 
     def read(self, prediction: Prediction, agent: int | str | None = None) -> np.ndarray:
         """Return the number asked for in every row of a prediction, shape (links,)."""
@@ -89,6 +96,7 @@ def question(
     quantity: str = "claimed",
     of: str | None = None,
     agent: int | str = "mean",
+    one_link: bool = True,
     **settings: Any,
 ) -> Question:
     """Check and return what is asked about.
@@ -101,6 +109,7 @@ def question(
     method, quantity, **settings : see `stochfuse.predict`; every method but "monte-carlo".
     of : name of the metric; default: the scenario's, else trace.
     agent : "mean", "worst", "best" or a number from 1.
+    one_link : whether the question is about one probability a link, so that links must have no memory.
 
     Raises
     ------
@@ -121,7 +130,8 @@ def question(
         raise UsageError(f"steady: expected method simplified, got {method}")
     if step is not None and not 1 <= step <= last:
         raise UsageError(f"step: expected a number from 1 to {last} (network.steps), got {step}")
-    if scenario.network.burst is not None or any(burst is not None for burst in scenario.network.case_bursts):
+    bursts = scenario.network.burst, *scenario.network.case_bursts
+    if one_link and any(burst is not None for burst in bursts):
         raise UsageError(
             "network.burst: expected links without memory, since the question is about one probability a link"
         )

@@ -19,6 +19,7 @@ from stochfuse.prediction.compare import Comparison, EstimatorComparison
 from stochfuse.report import predictions
 from stochfuse.report.plot import COLORS, MARKERS, below, figure_class, shades, spread, titled
 from stochfuse.report.predictions import PredictionView
+from stochfuse.report.rows import Curves
 from stochfuse.report.table import Report, Table, number, to_csv
 
 SCHEMA = "stochfuse.comparison/1"
@@ -76,19 +77,17 @@ def comparison_report(view: ComparisonView) -> Report:
 def compare_table(view: ComparisonView) -> Table:
     """Return rows of link probability and step, columns of methods."""
     p, digits = view.comparison.reference, view.views[0].digits
-    values, differences = view.values(), view.differences()
+    values, differences, names = view.values(), view.differences(), view.views[0].rows
     columns = [p.method, *(f"{m}, Δ{' %' if view.relative else ''}" for m in view.comparison.methods[1:])]
     rows = []
-    for i, µ in enumerate(p.link):
-        name = () if p.cases is None else (p.cases[i],)
-        for k, step in enumerate(view.views[0].steps):
+    for i, there in enumerate(view.views[0].there):
+        for k in np.flatnonzero(there):
             cells = []
             for m, value in enumerate(values[:, i, k]):
                 difference = f" {_signed(differences[m, i, k], value, digits)}" if m else ""
-                cells.append(number(value, digits) + difference + _error(view, m, i, k))
-            rows.append((*name, f"{µ:.6g}", str(step), *cells))
-    keys = ("µ", "k") if p.cases is None else ("links", "mean µ", "k")
-    return Table(view.titles, keys, tuple(columns), tuple(rows))
+                cells.append(number(value, digits) + difference + _error(view, m, i, int(k)))
+            rows.append((*names.cells(i), str(view.views[0].steps[k]), *cells))
+    return Table(view.titles, (*names.keys, "k"), tuple(columns), tuple(rows))
 
 
 def _signed(difference: float, value: float, digits: int) -> str:
@@ -106,14 +105,13 @@ def _error(view: ComparisonView, method: int, row: int, step: int) -> str:
 
 def compare_csv(view: ComparisonView) -> str:
     """One line per method, link probability and step."""
-    p, first = view.comparison.reference, view.views[0]
+    first = view.views[0]
     values = view.values()
     rows = []
     for m, each in enumerate(view.views):
         errors = view.errors(m)
-        for i, µ in enumerate(p.link):
-            case = "" if p.cases is None else p.cases[i]
-            for k, step in enumerate(first.steps):
+        for i, there in enumerate(first.there):
+            for k in np.flatnonzero(there):
                 difference = values[m, i, k] - values[0, i, k]
                 rows.append(
                     (
@@ -124,9 +122,8 @@ def compare_csv(view: ComparisonView) -> str:
                         first.metric.name,
                         first.unit,
                         first.agent,
-                        case,
-                        float(µ),
-                        int(step),
+                        *first.rows.record(i),
+                        int(first.steps[k]),
                         float(values[m, i, k]),
                         float(difference),
                         float(difference / values[0, i, k]) if values[0, i, k] else "",
@@ -134,7 +131,7 @@ def compare_csv(view: ComparisonView) -> str:
                     )
                 )
     headings = (
-        "method", "quantity", "stage", "nature", "metric", "unit", "agent", "case", "link", "step", "value",
+        "method", "quantity", "stage", "nature", "metric", "unit", "agent", *first.rows.headings, "step", "value",
         "difference", "relative_difference", "standard_error",
     )  # fmt: skip
     return to_csv(headings, rows)
@@ -150,9 +147,9 @@ def compare_json(view: ComparisonView) -> dict[str, Any]:
         methods[each.prediction.method] = {
             "nature": each.prediction.nature,
             "description": each.how,
-            "values": values[m].tolist(),
-            "difference": (values[m] - values[0]).tolist(),
-            **({} if errors is None else {"standard_error": errors.tolist()}),
+            "values": predictions.listed(values[m]),
+            "difference": predictions.listed(values[m] - values[0]),
+            **({} if errors is None else {"standard_error": predictions.listed(errors)}),
             "meta": {"notes": list(each.prediction.notes), **each.prediction.meta},
         }
     return {
@@ -161,8 +158,7 @@ def compare_json(view: ComparisonView) -> dict[str, Any]:
         "quantity": p.quantity,
         "metric": first.metric.name,
         "reference": p.method,
-        "link": p.link.tolist(),
-        **({} if p.cases is None else {"cases": list(p.cases)}),
+        **first.rows.facts,
         "steps": first.steps.tolist(),
         "methods": methods,
         "scenario": p.scenario.to_mapping(),
@@ -177,14 +173,8 @@ def draw(view: ComparisonView):
 
     p, first = view.comparison.reference, view.views[0]
     values, differences = view.values(), view.differences()
-    against_link = p.cases is None and len(p.link) > 1
-    if against_link:
-        order = np.argsort(p.link)
-        x, along = p.link[order], lambda a, c: a[order, c]
-        chosen, names = spread(len(first.steps)), [f"k = {k}" for k in first.steps]
-    else:
-        x, along = first.steps, lambda a, c: a[c]
-        chosen, names = spread(len(p.link)), list(p.cases or [f"mean µ = {µ:.3g}" for µ in p.link])
+    curves = first.rows.curves(first.steps)
+    chosen = spread(len(curves.names))
     figure = figure_class()(figsize=(11, 5.4), layout="constrained")
     left, right = figure.subplots(1, 2)
     colors = shades(len(chosen))
@@ -193,22 +183,23 @@ def draw(view: ComparisonView):
         errors = view.errors(m)
         style: dict[str, Any] = {"linestyle": styles[m % 4], "marker": MARKERS[m], "markersize": 4}
         for c, color in zip(chosen, colors, strict=True):
-            left.plot(x, along(values[m], c), color=color, **style)
+            x, pick = curves.x[c], curves.picks[c]
+            left.plot(x, values[m][pick], color=color, **style)
             if m and errors is None:
-                right.plot(x, along(differences[m], c), color=color, **style)
-            elif m:
-                scale = 100.0 / along(values[0], c) if view.relative else 1.0
-                bars = 1.96 * along(errors, c) * scale
-                right.errorbar(x, along(differences[m], c), bars, color=color, capsize=2, **style)
+                right.plot(x, differences[m][pick], color=color, **style)
+            elif m and errors is not None:
+                scale = 100.0 / values[0][pick] if view.relative else 1.0
+                bars = 1.96 * errors[pick] * scale
+                right.errorbar(x, differences[m][pick], bars, color=color, capsize=2, **style)
     unit = f" [{first.unit}]" if first.unit else ""
     left.set_ylabel(first.axis)
-    if values.min() >= 0:
+    if np.nanmin(values) >= 0:
         left.set_ylim(bottom=0)
     right.axhline(0, color="0.3", linewidth=0.8)
     right.set_ylabel(f"difference from {p.method}" + (" [%]" if view.relative else unit))
     for axes in (left, right):
-        axes.set_xlabel("link probability µ" if against_link else "step k")
-        if not against_link:
+        axes.set_xlabel(curves.label)
+        if curves.whole:
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.grid(alpha=0.3)
     methods = [
@@ -223,10 +214,11 @@ def draw(view: ComparisonView):
         )
         for m, q in enumerate(view.comparison.predictions)
     ]
-    steps = [Line2D([], [], color=color, linewidth=3, label=names[c]) for c, color in zip(chosen, colors, strict=True)]
+    shown = zip(chosen, colors, strict=True)
+    steps = [Line2D([], [], color=color, linewidth=3, label=curves.names[c]) for c, color in shown]
     below(figure, [*methods, *steps])
     bars = "; bars: 95 % confidence" if any(view.errors(m) is not None for m in range(len(view.views))) else ""
-    titled(figure, first.what, first.whom + bars)
+    titled(figure, first.what + (f", {curves.at}" if curves.at else ""), first.whom + bars)
     return figure
 
 
@@ -299,7 +291,7 @@ class EstimatorView:
 
     @property
     def _sampled(self) -> list[Any]:
-        return [p for p in self.comparison.predictions if p.sampled is not None]
+        return [view[0].prediction for view in self.views if view[0].sampled]
 
 
 def estimator_report(view: EstimatorView) -> Report:
@@ -309,23 +301,20 @@ def estimator_report(view: EstimatorView) -> Report:
 
 def estimator_table(view: EstimatorView) -> Table:
     """Return rows of link probability, step and estimator, columns of quantities."""
-    p = view.comparison.predictions[0]
-    steps, stepwise = view.views[0][0].steps, view.every_step or view.at is not None
+    first, stepwise = view.views[0][0], view.every_step or view.at is not None
     rows = []
-    for i, µ in enumerate(p.link):
-        name = () if p.cases is None else (p.cases[i],)
-        for k in range(len(steps)) if stepwise else [len(steps) - 1]:
+    for i, there in enumerate(first.there):
+        for k in np.flatnonzero(there)[slice(None) if stepwise else slice(-1, None)]:
             for estimator, values, errors in zip(view.comparison.estimators, view.values, view.errors, strict=True):
                 cells = [
                     number(value[i, k], view.digits)
                     + ("" if error is None or quantity == "consistency" else f" ±{error[i, k]:.2g}")
                     for quantity, value, error in zip(view.quantities, values, errors, strict=True)
                 ]
-                step = (str(steps[k]),) if stepwise else ()
-                rows.append((*name, f"{µ:.6g}", *step, estimator, *cells))
-    keys = ("µ",) if p.cases is None else ("links", "mean µ")
+                step = (str(first.steps[k]),) if stepwise else ()
+                rows.append((*first.rows.cells(i), *step, estimator, *cells))
     columns = tuple("ratio" if q == "consistency" else q for q in view.quantities)
-    return Table(view.titles, (*keys, *(("k",) if stepwise else ()), "estimator"), columns, tuple(rows))
+    return Table(view.titles, (*first.rows.keys, *(("k",) if stepwise else ()), "estimator"), columns, tuple(rows))
 
 
 def estimator_csv(view: EstimatorView) -> str:
@@ -346,9 +335,9 @@ def estimator_json(view: EstimatorView) -> dict[str, Any]:
     for q, values, errors in zip(view.comparison.predictions, view.values, view.errors, strict=True):
         quantities = {}
         for name, value, error in zip(view.quantities, values, errors, strict=True):
-            quantities[name] = {"values": value.tolist()}
+            quantities[name] = {"values": predictions.listed(value)}
             if error is not None:
-                quantities[name]["standard_error"] = error.tolist()
+                quantities[name]["standard_error"] = predictions.listed(error)
         meta = {key: q.meta[key] for key in ("runs", "seed", "outcomes") if key in q.meta}
         found[q.estimator] = {
             "method": q.method,
@@ -360,8 +349,7 @@ def estimator_json(view: EstimatorView) -> dict[str, Any]:
         "schema": ESTIMATORS_SCHEMA,
         "version": __version__,
         "metric": view.metric.name,
-        "link": p.link.tolist(),
-        **({} if p.cases is None else {"cases": list(p.cases)}),
+        **view.views[0][0].rows.facts,
         "steps": view.views[0][0].steps.tolist(),
         "estimators": found,
         "scenario": p.scenario.to_mapping(),
@@ -375,55 +363,71 @@ def estimator_json(view: EstimatorView) -> dict[str, Any]:
     }
 
 
+MOST_GROUPS = 4
+"""Rows of panels, where what is swept has a second axis."""
+
+
 def draw_estimators(view: EstimatorView):
-    """Return the figure: a panel for quantities with the metric's unit, one for the ratio."""
+    """Return the figure: a panel for quantities with the metric's unit, one for the ratio; a row of them a group."""
     Figure = figure_class()
     from matplotlib.lines import Line2D
 
-    p = view.comparison.predictions[0]
     axis_of = [RATIO if q == "consistency" else view.views[0][c].axis for c, q in enumerate(view.quantities)]
     panels = list(dict.fromkeys(axis_of))
-    figure = Figure(figsize=(2.0 + 4.6 * len(panels), 5.4), layout="constrained")
-    axes_of = dict(zip(panels, figure.subplots(1, len(panels), squeeze=False)[0], strict=True))
+    first = view.views[0][0]
+    curves, cases = _drawn(first)
+    chosen = spread(len(curves.names))[:MOST_GROUPS]
+    figure = Figure(figsize=(2.0 + 4.6 * len(panels), 1.4 + 4.0 * len(chosen)), layout="constrained")
+    grid = figure.subplots(len(chosen), len(panels), squeeze=False)
     colors = [COLORS[e % len(COLORS)] for e in range(len(view.values))]
-    over_rows = len(p.link) > 1
-    order = np.argsort(p.link, kind="stable") if p.cases is None else np.arange(len(p.link))
-    steps = view.views[0][0].steps
-    x = steps if not over_rows else p.link[order] if p.cases is None else order
-    for e, (values, color) in enumerate(zip(view.values, colors, strict=True)):
-        for c, quantity in enumerate(view.quantities):
-            y = values[c][order, -1] if over_rows else values[c][0]
-            style = "" if over_rows and p.cases is not None else STYLES[quantity]
-            # cases are no sequence: claimed is a hollow marker there
-            face = "none" if not style and quantity == "claimed" else color
-            marker = _marker(e) if len(x) <= 30 else None
-            size = 9 if not style and quantity == "claimed" else 5
-            axes_of[axis_of[c]].plot(
-                x, y, color=color, linestyle=style, marker=marker, markersize=size, markerfacecolor=face
-            )
-    for label, axes in axes_of.items():
-        _finish(axes, label, view, over_rows)
+    for row, c in zip(grid, chosen, strict=True):
+        axes_of = dict(zip(panels, row, strict=True))
+        for e, (values, color) in enumerate(zip(view.values, colors, strict=True)):
+            for q, quantity in enumerate(view.quantities):
+                style = "" if cases else STYLES[quantity]
+                # cases are no sequence: claimed is a hollow marker there
+                hollow = bool(cases) and quantity == "claimed"
+                axes_of[axis_of[q]].plot(
+                    curves.x[c],
+                    values[q][curves.picks[c]],
+                    color=color,
+                    linestyle=style,
+                    marker=_marker(e) if len(curves.x[c]) <= 30 else None,
+                    markersize=9 if hollow else 5,
+                    markerfacecolor="none" if hollow else color,
+                )
+        for label, axes in axes_of.items():
+            _finish(axes, label, curves, cases)
+            if len(chosen) > 1:
+                axes.set_title(curves.names[c], fontsize="small")
     names = [
         Line2D([], [], color=color, marker=_marker(e), markersize=5, label=name)
         for e, (name, color) in enumerate(zip(view.comparison.estimators, colors, strict=True))
     ]
-    hollow = over_rows and p.cases is not None
     kinds = [
-        Line2D([], [], color="0.2", linestyle=STYLES[q], label=q + " (hollow)" * (hollow and q == "claimed"))
+        Line2D([], [], color="0.2", linestyle=STYLES[q], label=q + " (hollow)" * (bool(cases) and q == "claimed"))
         for q in view.quantities
         if q != "consistency"
     ]
     below(figure, [*names, *kinds])
-    where = f"after step {steps[-1]}" if over_rows else p.cases[0] if p.cases else f"µ = {p.link[0]:.3g}"
-    title = f"What estimators claim and what is true, {where}; {view.views[0][0].whom}"
+    where = curves.at or first.rows.name(0)
+    title = f"What estimators claim and what is true, {where}; {first.whom}"
     titled(figure, title)
     return figure
 
 
-def _finish(axes: Any, label: str, view: EstimatorView, over_rows: bool) -> None:
+def _drawn(first: PredictionView) -> tuple[Curves, tuple[str, ...]]:
+    """Along what estimators are drawn, and the cases if along these, one beside another."""
+    cases = first.prediction.cases
+    if cases is None or len(cases) == 1 or first.rows.over is not None:
+        return first.rows.curves(first.steps, last=True), ()
+    rows = np.arange(len(cases))
+    return Curves([rows], "", [""], [(rows, -1)], "rows", at=f"after step {first.steps[-1]}"), cases
+
+
+def _finish(axes: Any, label: str, curves: Curves, cases: Sequence[str]) -> None:
     from matplotlib.ticker import MaxNLocator
 
-    p = view.comparison.predictions[0]
     axes.set_ylabel(label)
     axes.grid(alpha=0.3)
     if label == RATIO:
@@ -432,11 +436,11 @@ def _finish(axes: Any, label: str, view: EstimatorView, over_rows: bool) -> None
         axes.set_ylim(min(low, 0.9), max(high, 1.1))
     elif axes.get_ylim()[0] > 0:
         axes.set_ylim(bottom=0)
-    if over_rows and p.cases is not None:
-        axes.set_xticks(range(len(p.cases)), ["\n".join(wrap(case, 16)) for case in p.cases], fontsize="small")
+    if cases:
+        axes.set_xticks(range(len(cases)), ["\n".join(wrap(case, 16)) for case in cases], fontsize="small")
     else:
-        axes.set_xlabel("link probability µ" if over_rows else "step k")
-    if not over_rows:
+        axes.set_xlabel(curves.label)
+    if curves.whole:
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from stochfuse import __version__
 from stochfuse.kalman.metrics import Metric
-from stochfuse.questions.messages import IDENTITY_BYTES, NUMBER_BYTES, Accuracy, Bytes, MessageLoad, in_bytes
-from stochfuse.report.plot import MARKERS, below, figure_class, spread, titled
+from stochfuse.questions.messages import IDENTITY_BYTES, NUMBER_BYTES, Accuracy, Bytes, Load, in_bytes
+from stochfuse.report.plot import COLORS, MARKERS, below, figure_class, spread, titled
 from stochfuse.report.predictions import PredictionView
+from stochfuse.report.rows import Rows
 from stochfuse.report.table import Report, Table, number, to_csv
 from stochfuse.scenario.registry import LFG, NAIVE
 
@@ -54,8 +56,8 @@ class LoadView:
     digits : significant digits in tables.
     """
 
-    loads: tuple[MessageLoad, ...]
-    messages: MessageLoad
+    loads: tuple[Load, ...]
+    messages: Load
     kind: str = "moments"
     agent: int | str = "mean"
     header: int | None = None
@@ -63,7 +65,12 @@ class LoadView:
     metric: Metric | None = None
     digits: int = 5
 
-    def bytes_of(self, load: MessageLoad) -> Bytes:
+    @cached_property
+    def rows(self) -> Rows:
+        """What the rows stand for."""
+        return Rows(self.loads[0])
+
+    def bytes_of(self, load: Load) -> Bytes:
         """Return a load in bytes."""
         return in_bytes(load, self.messages, header=self.header or 0, agent=self.agent)
 
@@ -76,8 +83,9 @@ class LoadView:
     @property
     def whom(self) -> str:
         """One line: the scenario, whose load and which steps."""
-        scenario, one = self.loads[0].scenario, self.loads[0].probabilities.shape[2] == 1
-        n = scenario.network.agents
+        scenario, one = self.loads[0].scenario, self.loads[0].alike
+        numbers = [s.network.agents for s in (self.rows.over.scenarios if self.rows.over else (scenario,))]
+        n = max(numbers)
         whose = (
             "alone"
             if n == 1
@@ -88,8 +96,9 @@ class LoadView:
             else ""
         )
         whose = whose or f"agent {self.agent}"
-        agents = f"{n} agent{'s' * (n > 1)}, {scenario.network.architecture}"
-        return f"{scenario.name}: {agents}; {whose}; {self.window}"
+        span = f"{min(numbers)} to " * (len(set(numbers)) > 1) + str(n)
+        agents = f"{span} agent{'s' * (n > 1)}, {scenario.network.architecture}"
+        return f"{scenario.name}: {agents}; {whose}; {self.window}{self.rows.common}"
 
     @property
     def what(self) -> str:
@@ -120,11 +129,11 @@ class LoadView:
             )
         return tuple(lines)
 
-    def how(self, load: MessageLoad) -> str:
+    def how(self, load: Load) -> str:
         """What a rule sends and how exact its load is."""
-        if load.sample is None:
+        if load.runs is None:
             return f"{RULE_TITLES[load.rule]}; exact"
-        runs = f"{load.sample.shape[1]:,} runs, seed {load.seed}"
+        runs = f"{load.runs:,} runs, seed {load.seed}"
         return f"{RULE_TITLES[load.rule]}; sampled, {runs}; ± one standard error"
 
     def accuracy_view(self, accuracy: Accuracy) -> PredictionView:
@@ -159,18 +168,11 @@ def load_table(view: LoadView) -> Table:
         if accuracy is not None:
             columns.append(f"{short} {accuracy.prediction.quantity}")
             cells.append(_numbers(accuracy.values, accuracy.error, view.digits))
-    first = view.loads[0]
-    keys = [(f"{µ:.6g}",) if first.cases is None else (first.cases[i], f"{µ:.4g}") for i, µ in enumerate(first.link)]
-    rows = tuple((*key, *row) for key, row in zip(keys, zip(*cells, strict=True), strict=True))
-    drawn = "drawn" if any(load.sample is not None for load in view.loads) else "possible"
+    rows = tuple((*view.rows.cells(i), *row) for i, row in enumerate(zip(*cells, strict=True)))
+    drawn = "drawn" if any(load.runs is not None for load in view.loads) else "possible"
     note = f"std: over outcomes, steps and agents; max: the largest load {drawn}"
     titles = (*view.titles, *([] if view.accuracies else [note]))
-    return Table(titles, (_mean(first),) if first.cases is None else ("links", _mean(first)), tuple(columns), rows)
-
-
-def _mean(load: MessageLoad) -> str:
-    link = load.scenario.network.link
-    return "µ" if load.cases is None and (link is None or link.ndim == 0) else "mean µ"
+    return Table(titles, view.rows.keys, tuple(columns), rows)
 
 
 def _numbers(values: np.ndarray, errors: np.ndarray | None, digits: int) -> list[str]:
@@ -178,11 +180,11 @@ def _numbers(values: np.ndarray, errors: np.ndarray | None, digits: int) -> list
     return shown if errors is None else [f"{v} ±{e:.2g}" for v, e in zip(shown, errors, strict=True)]
 
 
-def _names(load: MessageLoad) -> list[str]:
-    return list(load.cases or [f"{_mean(load)} = {µ:.4g}" for µ in load.link])
+def _names(view: LoadView) -> list[str]:
+    return [view.rows.name(row) for row in range(len(view.loads[0].link))]
 
 
-def _probabilities(load: MessageLoad, view: LoadView) -> np.ndarray:
+def _probabilities(load: Load, view: LoadView) -> np.ndarray:
     """Probabilities of each size, or of at most that, up to the largest one, (rows, sizes)."""
     values = load.cdf(view.agent) if view.kind == "cdf" else load.distribution(view.agent)
     return values[:, : load.maximum(view.agent).max() + 1]
@@ -193,19 +195,18 @@ def _distribution_table(view: LoadView) -> Table:
     for load in view.loads:
         values = _probabilities(load, view)
         rows += [(SHORT[load.rule], str(size), *_numbers(v, None, view.digits)) for size, v in enumerate(values.T)]
-    return Table(view.titles, ("rule", "nodes"), tuple(_names(view.loads[0])), tuple(rows))
+    return Table(view.titles, ("rule", "nodes"), tuple(_names(view)), tuple(rows))
 
 
 def load_csv(view: LoadView) -> str:
     """One line per rule and link probability, for distributions per size too."""
-    headings = ["rule", "nature", "agent", "case", "link", "from_step", "to_step"]
+    headings = ["rule", "nature", "agent", *view.rows.headings, "from_step", "to_step"]
     headings += HEADINGS[view.kind]
     rows: list[tuple[Any, ...]] = []
     for r, load in enumerate(view.loads):
         first, last = map(int, load.steps[[0, -1]])
-        for i, µ in enumerate(load.link.tolist()):
-            case = "" if load.cases is None else load.cases[i]
-            start = (load.rule, load.nature, view.agent, case, µ, first, last)
+        for i in range(len(load.link)):
+            start = (load.rule, load.nature, view.agent, *view.rows.record(i), first, last)
             if view.kind == "moments":
                 rows.append((*start, *_moments_cells(view, load, i)))
             elif view.kind == "accuracy":
@@ -216,7 +217,7 @@ def load_csv(view: LoadView) -> str:
     return to_csv(headings, rows)
 
 
-def _moments_cells(view: LoadView, load: MessageLoad, row: int) -> tuple[Any, ...]:
+def _moments_cells(view: LoadView, load: Load, row: int) -> tuple[Any, ...]:
     error, size = load.standard_error(view.agent), view.bytes_of(load)
     return (
         float(load.mean(view.agent)[row]),
@@ -277,8 +278,7 @@ def load_json(view: LoadView) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
         "version": __version__,
-        "link": first.link.tolist(),
-        **({} if first.cases is None else {"cases": list(first.cases)}),
+        **view.rows.facts,
         "steps": first.steps.tolist(),
         "rules": rules,
         "scenario": first.scenario.to_mapping(),
@@ -299,18 +299,26 @@ def draw(view: LoadView):
 
 
 def _draw_moments(view: LoadView, axes: Any) -> None:
-    first = view.loads[0]
-    if first.cases is not None or len(first.link) == 1:
+    if not view.rows.sequence:
         _draw_steps(view, axes)
         return
-    order = np.argsort(first.link)
-    for load, marker in zip(view.loads, MARKERS, strict=False):
-        mean, std, x = load.mean(view.agent)[order], load.std(view.agent)[order], load.link[order]
-        line = axes.plot(x, mean, marker=marker if len(x) <= 30 else None, markersize=4, label=SHORT[load.rule])
-        low = np.maximum(mean - std, 0)
-        axes.fill_between(x, low, mean + std, color=line[0].get_color(), alpha=0.15, linewidth=0)
-    axes.set_xlabel("link probability µ")
-    axes.set_ylabel("mean nodes per step (band: ± one standard deviation)")
+    curves = view.rows.curves(None)
+    chosen = spread(len(curves.names))
+    for load, style, marker in zip(view.loads, ("-", "--"), MARKERS, strict=False):
+        for c in chosen:
+            x, pick = curves.x[c], curves.picks[c]
+            mean, std = load.mean(view.agent)[pick], load.std(view.agent)[pick]
+            label = ", ".join(filter(None, (SHORT[load.rule], curves.names[c])))
+            few = {"marker": marker if len(x) <= 30 else None, "markersize": 4}
+            line = axes.plot(x, mean, linestyle=style if len(chosen) > 1 else "-", label=label, **few)
+            if len(chosen) == 1:
+                low, color = np.maximum(mean - std, 0), line[0].get_color()
+                axes.fill_between(x, low, mean + std, color=color, alpha=0.15, linewidth=0)
+    axes.set_xlabel(curves.label)
+    if curves.whole:
+        axes.xaxis.set_major_locator(_whole_numbers())
+    band = " (band: ± one standard deviation)" if len(chosen) == 1 else ""
+    axes.set_ylabel(f"mean nodes per step{band}")
 
 
 def _draw_steps(view: LoadView, axes: Any) -> None:
@@ -336,11 +344,11 @@ def _draw_distribution(view: LoadView, axes: Any) -> None:
     axes.xaxis.set_major_locator(_whole_numbers())
 
 
-def _curves(view: LoadView) -> Iterator[tuple[MessageLoad, str, str, Any, int]]:
+def _curves(view: LoadView) -> Iterator[tuple[Load, str, str, Any, int]]:
     """Load, line style, label, colour and row of every curve: a style per rule, a colour per row."""
     from matplotlib import colormaps
 
-    names = _names(view.loads[0])
+    names = _names(view)
     chosen = spread(len(names))
     colors = colormaps["viridis"](np.linspace(0, 0.9, len(chosen)))
     for load, style in zip(view.loads, ("-", "--"), strict=False):
@@ -355,18 +363,23 @@ def _whole_numbers() -> Any:
 
 
 def _draw_accuracy(view: LoadView, axes: Any) -> None:
+    bare = view.rows.over is None and view.loads[0].cases is None
+    names = [f"{µ:.3g}" for µ in view.loads[0].link] if bare else _names(view)
+    picks = view.rows.curves(None).picks if view.rows.sequence else [(np.argsort(view.loads[0].link),)]
     for r, accuracy in enumerate(view.accuracies):
         load = accuracy.load.mean(view.agent)
-        order = np.argsort(accuracy.load.link)
-        errors = None if accuracy.error is None else 1.96 * accuracy.error[order]
-        label = SHORT[accuracy.load.rule]
-        axes.errorbar(load[order], accuracy.values[order], errors, marker=MARKERS[r], capsize=2, label=label)
-        names = accuracy.load.cases or [f"{µ:.3g}" for µ in accuracy.load.link]
+        for c, (order,) in enumerate(picks):
+            errors = None if accuracy.error is None else 1.96 * accuracy.error[order]
+            label = None if c else SHORT[accuracy.load.rule]
+            axes.errorbar(
+                load[order], accuracy.values[order], errors, marker=MARKERS[r], color=COLORS[r], capsize=2, label=label
+            )
         for i in spread(len(names)):
             axes.annotate(
                 names[i], (load[i], accuracy.values[i]), xytext=(4, 4), textcoords="offset points", fontsize=7
             )
     shown = view.accuracy_view(view.accuracies[0])
     bars = "; bars: at least 95 % confidence" if view.accuracies[0].error is not None else ""
-    axes.set_xlabel(f"mean nodes per step (marks: link probability µ{bars})")
+    marks = "link probability µ" if view.rows.over is None else "what is swept"
+    axes.set_xlabel(f"mean nodes per step (marks: {marks}{bars})")
     axes.set_ylabel(shown.axis)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from textwrap import wrap
 from typing import Any
 
@@ -20,7 +21,9 @@ from stochfuse.prediction.predict import predict
 from stochfuse.prediction.quantities import OVERCONFIDENT, expectation, noun, title
 from stochfuse.prediction.quantities import unit as unit_of
 from stochfuse.prediction.result import Prediction
+from stochfuse.prediction.swept import Swept
 from stochfuse.report.plot import DASHES, MARKERS, below, direct, figure_class, shades, spread, titled
+from stochfuse.report.rows import Curves, Rows
 from stochfuse.report.table import Report, Table, number, to_csv
 from stochfuse.scenario.registry import OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.registry import title as method_title
@@ -53,13 +56,34 @@ class PredictionView:
     at : steps shown, in order; default: all.
     """
 
-    prediction: Prediction
+    prediction: Prediction | Swept
     metric: Metric
     agent: int | str = "mean"
-    baseline: Prediction | None = None
+    baseline: Prediction | Swept | None = None
     digits: int = 5
     statistic: str = "mean"
     at: tuple[int, ...] | None = None
+
+    @cached_property
+    def rows(self) -> Rows:
+        """What the rows stand for."""
+        return Rows(self.prediction)
+
+    @cached_property
+    def parts(self) -> tuple[Prediction, ...]:
+        """The prediction, or those of what was swept."""
+        return self.prediction.parts if isinstance(self.prediction, Swept) else (self.prediction,)
+
+    @property
+    def sampled(self) -> bool:
+        """Whether some of the values are sampled."""
+        return any(part.sampled is not None for part in self.parts)
+
+    @property
+    def there(self) -> np.ndarray:
+        """(rows, steps) whether a row has such a step: what is swept may be the number of steps."""
+        steps = np.concatenate([np.full(len(part.link), part.steps[-1]) for part in self.parts])
+        return self.steps <= steps[:, None]
 
     @property
     def steps(self) -> np.ndarray:
@@ -89,24 +113,28 @@ class PredictionView:
         if self.prediction.meta.get("faults"):  # items without an answer stay what they are
             return self._at(self.prediction.values(self.metric, self.agent))
         if self.statistic != "mean":
-            return _finite(self._at(self.prediction.statistic(self.statistic, self.metric, self.agent)))
+            return self._finite(self._at(self.prediction.statistic(self.statistic, self.metric, self.agent)))
         values = self.prediction.values(self.metric, self.agent)
         by = self.baseline and self.baseline.values(self.metric, self.agent)
-        return _finite(self._at(self._normalised(values, by)))
+        return self._finite(self._at(self._normalised(values, by)))
+
+    def _finite(self, values: np.ndarray) -> np.ndarray:
+        _finite(values[self.there])
+        return values
 
     def overconfidence(self) -> str:
         """Return a sentence if more is claimed than is true by over 5 %, where both are known; else nothing."""
         p = self.prediction
-        if p.moments.actual is None or p.method in (SIMPLIFIED, OPTIMAL):
+        if not p.with_actual or p.method in (SIMPLIFIED, OPTIMAL):
             return ""
         ratio = p.shown_as("consistency").values(self.metric, self.agent)
-        if ratio.max() <= OVERCONFIDENT:
+        if np.nanmax(ratio) <= OVERCONFIDENT:
             return ""
-        row, step = np.unravel_index(ratio.argmax(), ratio.shape)
-        where = f"µ = {p.link[row]:.6g}" if p.cases is None else p.cases[row]
+        row, step = np.unravel_index(np.nanargmax(ratio), ratio.shape)
+        where = self.rows.name(int(row)) if self.rows.over or p.cases is not None else f"µ = {p.link[row]:.6g}"
         return (
-            f"overconfident: the actual {self.metric.label} is up to {ratio.max():.3g} times the claimed one ({where}, "
-            f"step {p.steps[step]})"
+            f"overconfident: the actual {self.metric.label} is up to {np.nanmax(ratio):.3g} times the claimed one "
+            f"({where}, step {p.steps[step]})"
         )
 
     def steady(self) -> np.ndarray | None:
@@ -119,6 +147,8 @@ class PredictionView:
     def _normalised(self, values: np.ndarray, by: np.ndarray | None) -> np.ndarray:
         if by is None:
             return values
+        # of what was swept every point is relative to itself at link probability 0
+        by = by[self.rows.point]
         if (by == 0).any():
             raise UsageError(f"{self.full_noun} is 0 at link probability 0 and cannot be normalised to it")
         return values / by
@@ -160,20 +190,22 @@ class PredictionView:
     def whom(self) -> str:
         """One line: the scenario and whose covariance."""
         scenario = self.prediction.scenario
-        n = scenario.network.agents
-        return f"{scenario.name}: {n} agent{'s' * (n > 1)}, {scenario.network.architecture}{self._links}; {self._of}"
+        numbers = [part.scenario.network.agents for part in self.parts]
+        n = f"{min(numbers)} to " * (len(set(numbers)) > 1) + str(max(numbers))
+        agents = f"{n} agent{'s' * (max(numbers) > 1)}, {scenario.network.architecture}{self._links}"
+        return f"{scenario.name}: {agents}; {self._of}{self.rows.common}"
 
     @property
     def _links(self) -> str:
         """What the µ of a row does not say of the links."""
-        network = self.prediction.scenario.network
-        bursty = network.burst is not None or any(burst is not None for burst in network.case_bursts)
-        return ", bursty links" * bursty + ", delays" * (network.delay != (1.0,))
+        networks = [part.scenario.network for part in self.parts]
+        bursty = any(any(burst is not None for burst in (n.burst, *n.case_bursts)) for n in networks)
+        return ", bursty links" * bursty + ", delays" * any(n.delay != (1.0,) for n in networks)
 
     @property
     def _of(self) -> str:
         if self.prediction.alike:
-            return "every agent alike" if len(self.prediction.group_of) > 1 else "alone"
+            return "every agent alike" if any(len(part.group_of) > 1 for part in self.parts) else "alone"
         random = self.statistic not in ("mean", "derivative")
         texts = {
             "mean": "of an agent picked at random" if random else "covariance averaged over the agents",
@@ -186,23 +218,25 @@ class PredictionView:
     def how(self) -> str:
         """One line: the method and how exact it is."""
         p = self.prediction
-        return f"{method_title(p.method, p.estimator)}; {self.nature}"
+        natures = list(dict.fromkeys(map(self._nature, self.parts)))
+        # of many different ones the first and the last
+        nature = " … ".join([natures[0], natures[-1]] if len(natures) > 1 else natures)
+        return f"{method_title(p.method, p.estimator)}; {nature}"
 
-    @property
-    def nature(self) -> str:
+    def _nature(self, p: Prediction) -> str:
         """How exact the values are, in words."""
-        p = self.prediction
         if p.sampled is not None:
             return f"sampled, {p.sampled.runs:,} runs, seed {p.meta['seed']}; ± one standard error"
         if p.method == OPTIMAL:
             nature = "exact" if p.nature == "exact" else "enclosed in proved bounds"
             return nature if p.meta["paths"] is None else f"{nature}, {counted(p.meta['paths'], 'path')}"
-        if p.outcomes is None:
+        if p.method == SIMPLIFIED:
             return "approximate (mean field)"
-        everything = counted(p.meta["outcomes"], "outcome")
-        if p.nature == "exact":
-            return f"exact, {everything}"
-        return f"approximate, {everything} less those of probability up to {np.max(p.meta['left_out']):.2g}"
+        # of noises that differ outcomes are listed without being counted together
+        everything = f", {counted(p.meta['outcomes'], 'outcome')}" if "outcomes" in p.meta else ""
+        if p.nature == "exact" or "left_out" not in p.meta:
+            return f"{p.nature}{everything}"
+        return f"approximate{everything} less those of probability up to {np.max(p.meta['left_out']):.2g}"
 
 
 def counted(number: int, what: str) -> str:
@@ -226,24 +260,26 @@ def report(views: Sequence[PredictionView]) -> Report:
 
 def predict_table(view: PredictionView) -> Table:
     """Return rows of link probabilities (or cases) against columns of steps."""
-    p = view.prediction
     values, errors, steady = view.values(), view.errors(), view.steady()
     columns = [f"k={k}" for k in view.steps] + (["steady"] if steady is not None else [])
-    uniform = p.cases is None and _uniform(p)
     rows = []
-    for i, µ in enumerate(p.link):
-        name = () if p.cases is None else (p.cases[i],)
-        shown = [number(v, view.digits) for v in (*values[i], *([] if steady is None else [steady[i]]))]
+    for i, there in enumerate(view.there):
+        shown = [number(v, view.digits) for v in values[i]]
         if errors is not None:
             shown = [f"{value} ±{error:.2g}" for value, error in zip(shown, errors[i], strict=True)]
-        rows.append((*name, f"{µ:.6g}" if uniform else f"{µ:.4g}", *shown))
-    mean = "µ" if uniform else "mean µ"
-    keys = (mean,) if p.cases is None else ("links", mean)
-    return Table((view.what, view.whom, view.how), keys, tuple(columns), tuple(rows), over="k")
+        shown = [value if is_there else "" for value, is_there in zip(shown, there, strict=True)]
+        rows.append((*view.rows.cells(i), *shown, *([] if steady is None else [number(steady[i], view.digits)])))
+    return Table((view.what, view.whom, view.how), view.rows.keys, tuple(columns), tuple(rows), over="k")
 
 
-def _uniform(p: Prediction) -> bool:
-    return p.scenario.network.link is None or p.scenario.network.link.ndim == 0
+def listed(values: np.ndarray) -> Any:
+    """Nested lists of numbers for JSON, null for what a row does not have."""
+    missing = np.isnan(values)
+    if not missing.any():
+        return values.tolist()
+    out = values.astype(object)
+    out[missing] = None
+    return out.tolist()
 
 
 def predict_csv(view: PredictionView) -> str:
@@ -254,15 +290,14 @@ def predict_csv(view: PredictionView) -> str:
     metric = metric if view.statistic == "mean" else f"{view.statistic}({metric})"
     labels = (p.method, p.quantity, p.stage, p.nature, metric, view.unit, view.agent)
     rows = []
-    for i, µ in enumerate(p.link):
-        case = "" if p.cases is None else p.cases[i]
-        rows += [(*labels, case, float(µ), int(k), float(v)) for k, v in zip(view.steps, values[i], strict=True)]
-        if errors is not None:
-            new = slice(-len(view.steps), None)
-            rows[new] = [(*row, float(error)) for row, error in zip(rows[new], errors[i], strict=True)]
+    for i, there in enumerate(view.there):
+        label = (*labels, *view.rows.record(i))
+        error = [()] * len(there) if errors is None else [(float(e),) for e in errors[i]]
+        rows += [(*label, int(view.steps[c]), float(values[i, c]), *error[c]) for c in np.flatnonzero(there)]
         if steady is not None:
-            rows.append((*labels, case, float(µ), "steady", float(steady[i])))
-    headings = ("method", "quantity", "stage", "nature", "metric", "unit", "agent", "case", "link", "step", "value")
+            rows.append((*label, "steady", float(steady[i])))
+    what = ("method", "quantity", "stage", "nature", "metric", "unit", "agent")
+    headings = (*what, *view.rows.headings, "step", "value")
     return to_csv(headings if errors is None else (*headings, "standard_error"), rows)
 
 
@@ -276,9 +311,9 @@ def predict_json(view: PredictionView) -> dict[str, Any]:
         "method": p.method,
         "quantity": p.quantity,
         "metric": view.metric.name,
-        "link": p.link.tolist(),
+        **view.rows.facts,
         "steps": view.steps.tolist(),
-        "values": view.values().tolist(),
+        "values": listed(view.values()),
         "scenario": p.scenario.to_mapping(),
         "meta": {
             "description": [view.what, view.whom, view.how],
@@ -300,19 +335,17 @@ def predict_json(view: PredictionView) -> dict[str, Any]:
     errors = view.errors()
     if errors is not None:
         half = WIDTH_95 * errors
-        result["standard_error"] = errors.tolist()
+        result["standard_error"] = listed(errors)
         result["interval"] = {
             "level": LEVEL,
-            "low": (view.values() - half).tolist(),
-            "high": (view.values() + half).tolist(),
+            "low": listed(view.values() - half),
+            "high": listed(view.values() + half),
         }
-    elif view.metric.linear and view.statistic == "mean" and not view.baseline:
+    elif isinstance(p, Prediction) and view.metric.linear and view.statistic == "mean" and not view.baseline:
         polynomials = p.polynomials(view.metric, view.agent)
         if polynomials is not None:
             # E(µ) = sum over c of coefficients[c] µ^c (1−µ)^(L−c), L + 1 = len(coefficients), one list per step
             result["bernstein"] = [polynomials[k - 1].tolist() for k in view.steps]
-    if p.cases is not None:
-        result["cases"] = list(p.cases)
     if steady is not None and p.steady_bound is not None:
         worst = p.steady_bound.max(axis=1)
         result["steady"] = steady.tolist()
@@ -326,18 +359,16 @@ RATIO = "actual / claimed"
 
 def side_table(views: Sequence[PredictionView]) -> Table:
     """Return rows of link probability and step, columns of quantities."""
-    p = views[0].prediction
     values, errors = [view.values() for view in views], [view.errors() for view in views]
-    rows = []
-    for i, µ in enumerate(p.link):
-        name = () if p.cases is None else (p.cases[i],)
-        for k, step in enumerate(views[0].steps):
+    rows, names = [], views[0].rows
+    for i, there in enumerate(views[0].there):
+        for k in np.flatnonzero(there):
             cells = [
                 number(value[i, k], views[0].digits) + ("" if error is None else f" ±{error[i, k]:.2g}")
                 for value, error in zip(values, errors, strict=True)
             ]
-            rows.append((*name, f"{µ:.6g}", str(step), *cells))
-    keys = ("µ", "k") if p.cases is None else ("links", "mean µ", "k")
+            rows.append((*names.cells(i), str(views[0].steps[k]), *cells))
+    keys = (*names.keys, "k")
     how = dict.fromkeys(view.how for view in views)
     titles = (*(view.what for view in views), views[0].whom, *how)
     return Table(titles, keys, tuple(view.prediction.quantity for view in views), tuple(rows))
@@ -369,10 +400,8 @@ def draw_side(views: Sequence[PredictionView]):
     """Return the figure, one panel for each unit."""
     from matplotlib.lines import Line2D
 
-    p, steps = views[0].prediction, views[0].steps
-    over = _over_links(views[0])
-    chosen = spread(len(steps) if over else len(p.link))
-    names = [f"k = {k}" for k in steps] if over else _row_names(p)
+    curves = views[0].rows.curves(views[0].steps)
+    chosen = spread(len(curves.names))
     units = list(dict.fromkeys(_axis(view) for view in views))
     figure = figure_class()(figsize=(1.5 + 5.0 * len(units), 5.6), layout="constrained")
     panels = dict(zip(units, figure.subplots(1, len(units), squeeze=False)[0], strict=True))
@@ -380,10 +409,10 @@ def draw_side(views: Sequence[PredictionView]):
     for v, view in enumerate(views):
         axes = panels[_axis(view)]
         for c, color in zip(chosen, colors, strict=True):
-            _curve(axes, view, c, color=color, linestyle=STYLES[v % 4], marker=MARKERS[v])
+            _curve(axes, view, curves, c, color=color, linestyle=STYLES[v % 4], marker=MARKERS[v])
     for label, axes in panels.items():
         shown = [view for view in views if _axis(view) == label]
-        _dress(axes, shown[0], label, zero=label != RATIO and all(view.values().min() >= 0 for view in shown))
+        _dress(axes, curves, label, zero=label != RATIO and all(np.nanmin(view.values()) >= 0 for view in shown))
     quantities = [
         Line2D(
             [], [], color="0.2", linestyle=STYLES[v % 4], marker=MARKERS[v], markersize=4, label=w.prediction.quantity
@@ -395,14 +424,15 @@ def draw_side(views: Sequence[PredictionView]):
         [
             *quantities,
             *(
-                Line2D([], [], color=color, linewidth=3, label=names[c])
+                Line2D([], [], color=color, linewidth=3, label=curves.names[c])
                 for c, color in zip(chosen, colors, strict=True)
             ),
         ],
     )
-    sampled = "; bands: 95 % confidence" if p.sampled is not None else ""
+    p, at = views[0].prediction, f", {curves.at}" if curves.at else ""
+    sampled = "; bands: 95 % confidence" if views[0].sampled else ""
     how = dict.fromkeys(f"{view.how}{sampled}" for view in views)
-    titled(figure, f"{views[0].whom}; expected {p.stage} covariances and errors", *how)
+    titled(figure, f"{views[0].whom}; expected {p.stage} covariances and errors{at}", *how)
     return figure
 
 
@@ -413,50 +443,53 @@ def _axis(view: PredictionView) -> str:
 def draw(view: PredictionView):
     """Return the figure, not shown and not registered with pyplot."""
     figure = figure_class()(figsize=(7.5, 5.0), layout="constrained")
-    draw_on(figure.add_subplot(), view)
-    bars = "; bands: 95 % confidence" if view.prediction.sampled is not None else ""
-    titled(figure, view.what, view.whom, view.how + bars)
+    at = draw_on(figure.add_subplot(), view)
+    bars = "; bands: 95 % confidence" if view.sampled else ""
+    titled(figure, view.what + (f", {at}" if at else ""), view.whom, view.how + bars)
     return figure
 
 
-def draw_on(axes: Any, view: PredictionView) -> None:
-    """Draw the values on some axes: against link probability, a curve a step, or against the step, a curve a row."""
-    p = view.prediction
-    over = _over_links(view)
-    chosen = spread(len(view.steps) if over else len(p.link))
-    names = [f"k = {k}" for k in view.steps] if over else _row_names(p)
-    fine = _smooth(view) if over else None
+def draw_on(axes: Any, view: PredictionView) -> str:
+    """Draw the values on some axes, and return where they are taken if the curves' names do not say it.
+
+    Against link probability or a swept key, a curve a step or a further key's value; or against the step, a curve a
+    row.
+    """
+    curves = view.rows.curves(view.steps)
+    chosen = spread(len(curves.names))
+    fine = _smooth(view) if curves.what == "steps" and view.rows.over is None else None
     lines = [
-        _curve(axes, view, c, color=color, linestyle=DASHES[i], marker=MARKERS[i], fine=fine)
+        _curve(axes, view, curves, c, color=color, linestyle=DASHES[i], marker=MARKERS[i], fine=fine)
         for i, (c, color) in enumerate(zip(chosen, shades(len(chosen)), strict=True))
     ]
     if view.statistic == "mean":
         label = view.axis
     else:
         label = "\n".join(wrap(view.what.partition(": ")[2].partition(" [no unit")[0], 45))
-    _dress(axes, view, label, zero=view.values().min() >= 0)
-    whole, what = (len(view.steps), "steps") if over else (len(p.link), "rows")
+    _dress(axes, curves, label, zero=np.nanmin(view.values()) >= 0)
+    whole = len(curves.names)
     direct(
-        axes, lines, [names[c] for c in chosen], None if len(chosen) == whole else f"{len(chosen)} of {whole} {what}"
+        axes,
+        lines,
+        [curves.names[c] for c in chosen],
+        None if len(chosen) == whole else f"{len(chosen)} of {whole} {curves.what}",
     )
-
-
-def _over_links(view: PredictionView) -> bool:
-    """Whether curves run over link probabilities: a step each; else over the steps, a row each."""
-    return view.prediction.cases is None and len(view.prediction.link) > 1
-
-
-def _row_names(p: Prediction) -> list[str]:
-    return list(p.cases or [f"{'µ' if _uniform(p) else 'mean µ'} = {µ:.3g}" for µ in p.link])
+    return curves.at
 
 
 def _curve(
-    axes: Any, view: PredictionView, c: int, *, fine: PredictionView | None = None, marker: str, **style: Any
+    axes: Any,
+    view: PredictionView,
+    curves: Curves,
+    c: int,
+    *,
+    fine: PredictionView | None = None,
+    marker: str,
+    **style: Any,
 ) -> Any:
-    """Draw one step over the link probabilities, or one row over the steps: a line, the asked points, a band."""
-    p, values, errors = view.prediction, view.values(), view.errors()
-    over, order = _over_links(view), np.argsort(p.link)
-    x, y = (p.link[order], values[order, c]) if over else (view.steps, values[c])
+    """Draw one curve: a line, the asked points, a band."""
+    values, errors, x = view.values(), view.errors(), curves.x[c]
+    y = values[curves.picks[c]]
     few = len(x) <= 30
     if fine is None:
         (line,) = axes.plot(x, y, marker=marker if few else None, markersize=4, **style)
@@ -464,17 +497,17 @@ def _curve(
         (line,) = axes.plot(fine.prediction.link, fine.values()[:, c], **style)
         axes.plot(x, y, linestyle="none", marker=marker if few else None, markersize=4, color=style["color"])
     if errors is not None:
-        reach = WIDTH_95 * (errors[order, c] if over else errors[c])
+        reach = WIDTH_95 * errors[curves.picks[c]]
         axes.fill_between(x, y - reach, y + reach, color=style["color"], alpha=0.2, linewidth=0)
     return line
 
 
-def _dress(axes: Any, view: PredictionView, label: str, *, zero: bool) -> None:
+def _dress(axes: Any, curves: Curves, label: str, *, zero: bool) -> None:
     from matplotlib.ticker import MaxNLocator
 
     axes.set_ylabel(label)
-    axes.set_xlabel("link probability µ" if _over_links(view) else "step k")
-    if not _over_links(view):
+    axes.set_xlabel(curves.label)
+    if curves.whole:
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if zero:
         axes.set_ylim(bottom=0)
@@ -488,8 +521,10 @@ SMOOTH = 101
 def _smooth(view: PredictionView) -> PredictionView | None:
     """The same at many link probabilities, where that is cheap; None where it is not, or rows are not one µ each."""
     p = view.prediction
+    if isinstance(p, Swept):
+        return None
     cheap = p.method == SIMPLIFIED or (p.outcomes is not None and p.outcomes.polynomial)
-    if not cheap or not _uniform(p) or view.baseline is not None or len(p.link) >= SMOOTH:
+    if not cheap or view.rows.mean != "µ" or view.baseline is not None or len(p.link) >= SMOOTH:
         return None
     link = np.union1d(p.link, np.linspace(p.link.min(), p.link.max(), SMOOTH))
     asked: dict[str, Any] = {} if p.method == SIMPLIFIED else {"estimator": p.estimator}

@@ -11,10 +11,12 @@ from stochfuse.estimators.fusion_graph import FusionGraph
 from stochfuse.kalman.metrics import metric
 from stochfuse.prediction.compare import Comparison, EstimatorComparison
 from stochfuse.prediction.result import Prediction
+from stochfuse.prediction.swept import Swept
 from stochfuse.questions.agents_needed import AgentsNeeded
 from stochfuse.questions.critical import Critical
 from stochfuse.questions.least_link import LeastLink
-from stochfuse.questions.messages import MessageLoad
+from stochfuse.questions.least_value import LeastValue
+from stochfuse.questions.messages import MessageLoad, SweptLoad
 from stochfuse.questions.sensitivity import Sensitivity, ShareOfGain
 from stochfuse.report import comparisons, fusion_graph, links, messages, predictions, solutions, study_figures
 from stochfuse.report.critical import critical_report
@@ -22,11 +24,13 @@ from stochfuse.report.plot import figure_class
 from stochfuse.report.predictions import PredictionView
 from stochfuse.report.table import Report, to_html, to_text
 from stochfuse.scenario.links import Links
+from stochfuse.scenario.over import Over
 from stochfuse.studies.files import Results
 
 SHEETS = {
     AgentsNeeded: solutions.agents_sheet,
     LeastLink: solutions.least_link_sheet,
+    LeastValue: solutions.value_sheet,
     Sensitivity: solutions.sensitivity_sheet,
     ShareOfGain: solutions.gain_sheet,
 }
@@ -45,13 +49,13 @@ def report_of(result: Any, of: str | None = None, agent: int | str = "mean") -> 
         return solutions.solution_report(sheet(result), result)
     if isinstance(result, Critical):
         return critical_report(result)
-    if isinstance(result, MessageLoad):
+    if isinstance(result, MessageLoad | SweptLoad):
         return messages.load_report(messages.LoadView((result,), result))
     if isinstance(result, Results):
         return study_figures.summary_report(result, 5)
     if isinstance(result, Links):
         return links.links_report(result)
-    scenario = (result if isinstance(result, Prediction) else result.predictions[0]).scenario
+    scenario = (result if isinstance(result, Prediction | Swept) else result.predictions[0]).scenario
     chosen = metric(of or scenario.metric or "trace", scenario.model)
     if isinstance(result, EstimatorComparison):
         return comparisons.estimator_report(comparisons.EstimatorView(result, chosen, agent))
@@ -87,7 +91,7 @@ def figure_of(result: Any, ax: Any = None, **shown: Any) -> Any:
         if drawing is None:
             raise UsageError(f"plot: there is no figure of a {type(result).__name__}")
         return drawing()
-    if not isinstance(result, Prediction):
+    if not isinstance(result, Prediction | Swept):
         raise UsageError(f"ax: expected none, a {type(result).__name__} needs axes of its own")
     predictions.draw_on(ax, _view(result, **shown))
     return ax.figure
@@ -103,7 +107,7 @@ def graph_figure(graph: FusionGraph, agent: int, step: int) -> Any:
     return fusion_graph.draw(graph, graph.explain(agent, step))
 
 
-def _view(p: Prediction, of: str | None = None, agent: int | str = "mean") -> PredictionView:
+def _view(p: Prediction | Swept, of: str | None = None, agent: int | str = "mean") -> PredictionView:
     return PredictionView(p, metric(of or p.scenario.metric or "trace", p.scenario.model), agent)
 
 
@@ -117,6 +121,9 @@ def frame_of(result: Any, **shown: Any) -> Any:
         text = io.StringIO(report_of(result).csv())
         return pandas.read_csv(text, converters=names, keep_default_na=False, na_values=[""])
     frame = pandas.read_csv(io.StringIO(report_of(result, **shown).csv()))
+    over = _over(result)
+    if over is not None:
+        frame = frame.rename(columns={key.title: key.name for key in over.keys})
     if isinstance(result, Prediction) and "faults" in result.meta:
         frame.insert(0, "item", [item for item in range(len(result.link)) for _ in result.steps])
     return frame
@@ -129,7 +136,7 @@ def arrays_of(result: Any) -> Any:
     axes receiver and sender.
     """
     xarray = installed("xarray")
-    if isinstance(result, Prediction):
+    if isinstance(result, Prediction | Swept):
         return _array(xarray, result)
     if isinstance(result, Links):
         return xarray.Dataset(**links.arrays(result))
@@ -141,7 +148,46 @@ def arrays_of(result: Any) -> Any:
     return frame_of(result).to_xarray()
 
 
-def _array(xarray: Any, p: Prediction) -> Any:
+def _over(result: Any) -> Over | None:
+    """What was swept, or None."""
+    first = result.predictions[0] if isinstance(result, Comparison | EstimatorComparison) else result
+    return first.over if isinstance(first, Swept | SweptLoad) else None
+
+
+def _array(xarray: Any, p: Prediction | Swept) -> Any:
+    return _of_points(xarray, p) if isinstance(p, Swept) else _of_one(xarray, p)
+
+
+def _of_points(xarray: Any, p: Swept) -> Any:
+    """Arrays of all points along an axis per key; those of points with one link along no other."""
+    index, first = installed("pandas").Index, "link" if p.cases is None else "case"
+    each = len(p.link) // len(p.over.points)
+    points = [_rows_of_point(xarray, p, k, each, first) for k in range(len(p.over.points))]
+    for key in reversed(p.over.keys):
+        n, named = len(key.values), index(key.values, name=key.name)
+        points = [
+            xarray.concat(points[i : i + n], named, join="outer", combine_attrs="drop_conflicts")
+            for i in range(0, len(points), n)
+        ]
+        for array in points:
+            array[key.name].attrs["units"] = key.unit
+    return points[0]
+
+
+def _rows_of_point(xarray: Any, p: Swept, point: int, each: int, first: str) -> Any:
+    """Rows of one point, along the links if there are several."""
+    together = len(p.parts) < len(p.over.points)
+    array = _of_one(xarray, p.parts[0 if together else point])
+    array = array.isel({first: slice(each * point, each * (point + 1))}) if together else array
+    if each == 1:
+        return array.isel({first: 0})
+    if first == "link" and len({tuple(row) for row in p.link.reshape(-1, each)}) > 1:
+        # links that differ from point to point are no axis
+        return array.rename({"link": "row"}).assign_coords(row=range(each), link=("row", array["link"].values))
+    return array
+
+
+def _of_one(xarray: Any, p: Prediction) -> Any:
     values, states = p.by_group[:, :, p.group_of], list(p.scenario.model.states)
     first = ("link", p.link) if p.cases is None else ("case", list(p.cases))
     axes = [first, ("step", p.steps), ("agent", range(1, len(p.group_of) + 1)), ("row", states), ("column", states)]

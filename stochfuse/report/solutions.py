@@ -15,10 +15,12 @@ from stochfuse import __version__
 from stochfuse.prediction.result import Prediction
 from stochfuse.questions.agents_needed import AgentsNeeded
 from stochfuse.questions.least_link import BESIDE, LeastLink
+from stochfuse.questions.least_value import LeastValue
 from stochfuse.questions.question import Question, described, named
 from stochfuse.questions.sensitivity import Sensitivity, ShareOfGain
 from stochfuse.report.plot import MARKERS, below, figure_class, spread, titled
 from stochfuse.report.predictions import PredictionView
+from stochfuse.report.rows import Rows
 from stochfuse.report.table import Report, Table, number, to_csv
 
 SCHEMA = "stochfuse.solution/1"
@@ -37,7 +39,7 @@ class SolutionSheet:
 
     Parameters
     ----------
-    kind : which question: "least-link", "agents-needed", "sensitivity", "gain" or "steady".
+    kind : which question: "least-link", "least-value", "agents-needed", "sensitivity", "gain" or "steady".
     question, prediction : what was asked about, and the prediction that labels it.
     answer : lines that say the answer in words.
     keys, columns, rows : the table.
@@ -166,6 +168,75 @@ def least_link_sheet(found: LeastLink, digits: int = 5) -> SolutionSheet:
         (record,),
         facts,
     )
+
+
+VALUE_PROOFS = {
+    "every": "proved: every whole number of the range was evaluated",
+    "monotone": "the value is monotone along {n} values of the range",
+    "grid": "the value goes up and down: found on a grid of {n} values, between which more may happen",
+}
+
+
+def value_sheet(found: LeastValue, digits: int = 5) -> SolutionSheet:
+    """Say the least or greatest value of a key, the value beside it that misses, and what proves it."""
+    asked, unit = found.question, f" {found.unit}" if found.unit else ""
+    low, high = (float(found.grid[0, i]) for i in (0, -1))
+    at, µ = f"{found.at:.{PRECISE}g}{unit}", Rows(found.prediction).cells(0)[-1]
+    at_most = f"{described(asked)} is at most {found.target:.9g}, at µ = {µ}"
+    single = len(found.met) == 1 and found.proof != "grid"
+    which = "at and above which" if found.direction == "least" else "at and below which"
+    lines = [f"{found.direction.capitalize()} {found.key}: {at}, {which if single else 'where'} {at_most}"]
+    if not single:
+        spans = "; ".join(f"from {a:.9g} to {b:.9g}" for a, b in found.met)
+        lines.append(f"Met for {found.key} {spans}")
+    proof = VALUE_PROOFS[found.proof].format(n=found.grid.shape[1])
+    if found.beside is None:
+        proof += "; no value of the range misses the target on that side"
+    else:
+        proof += f"; certified: {found.beside[0]:.17g} misses the target, {found.at:.17g} meets it"
+    lines.append(proof[0].upper() + proof[1:])
+    ends = [v if np.isfinite(v) else None for v in found.grid[1, [0, -1]].tolist()]
+    rows = [
+        (f"{found.direction} {found.key}", at),
+        ("target", f"{found.target:.{PRECISE}g}"),
+        ("value there", number(found.value, PRECISE)),
+        ("value beside it, which misses", "none" if found.beside is None else number(found.beside[1], PRECISE)),
+        *(
+            (f"value at {end:.6g}{unit}", "none" if v is None else number(v, digits))
+            for end, v in zip((low, high), ends, strict=True)
+        ),
+    ]
+    beside = None if found.beside is None else {"over": found.beside[0], "value": _finite_or_none(found.beside[1])}
+    facts = {
+        "target": found.target,
+        "link": float(found.prediction.link[0]),
+        "over": {
+            "key": found.key,
+            "unit": found.unit or None,
+            "value": found.at,
+            "direction": found.direction,
+            "proof": found.proof,
+        },
+        "value": found.value,
+        "between": [low, high],
+        "met": [list(span) for span in found.met],
+        "certificate": {"meets": {"over": found.at, "value": found.value}, "misses": beside},
+        "grid": [{"over": v, "value": _finite_or_none(e)} for v, e in found.grid.T.tolist()],
+    }
+    title = f"{found.key} [{found.unit}]" if found.unit else found.key
+    headings = ("step", "target", "link", title, "direction", "proof", "value", "misses_at")
+    record = (
+        *(_step(asked), found.target, float(found.prediction.link[0]), found.at),
+        *(found.direction, found.proof, found.value, _blank(None if found.beside is None else found.beside[0])),
+    )
+    return SolutionSheet(
+        "least-value", asked, found.prediction, tuple(lines), ("result",), ("value",), tuple(rows), headings,
+        (record,), facts,
+    )  # fmt: skip
+
+
+def _finite_or_none(value: float) -> float | None:
+    return value if np.isfinite(value) else None
 
 
 def agents_sheet(found: AgentsNeeded, digits: int = 5) -> SolutionSheet:
@@ -356,6 +427,7 @@ def draw(sheet: SolutionSheet, found: Any) -> Any:
     axes = figure.add_subplot()
     drawn: dict[str, Callable[..., None]] = {
         "least-link": _draw_least_link,
+        "least-value": _draw_value,
         "agents-needed": _draw_agents,
         "sensitivity": _draw_sensitivity,
         "gain": _draw_gain,
@@ -381,6 +453,17 @@ def _draw_least_link(axes: Any, sheet: SolutionSheet, found: LeastLink) -> None:
     axes.plot([found.link], [found.value], "o", color="C3", label=f"least µ = {found.link:.6g}")
     axes.axvline(found.link, color="C3", linestyle=":", linewidth=1)
     _finish(axes, "link probability µ", _label(sheet))
+
+
+def _draw_value(axes: Any, sheet: SolutionSheet, found: LeastValue) -> None:
+    axes.plot(*found.grid, ".-", color="C0", markersize=3, label=f"value, {sheet.question.when}")
+    axes.axhline(found.target, color="C3", linestyle="--", linewidth=1, label=f"target {found.target:.6g}")
+    for i, (a, b) in enumerate(found.met):
+        axes.axvspan(a, b, color="C2", alpha=0.12, linewidth=0, label="met" if i == 0 else None)
+    unit = f" [{found.unit}]" if found.unit else ""
+    axes.plot([found.at], [found.value], "o", color="C3", label=f"{found.direction}: {found.at:.6g}")
+    axes.axvline(found.at, color="C3", linestyle=":", linewidth=1)
+    _finish(axes, f"{found.key}{unit}", _label(sheet))
 
 
 def _draw_agents(axes: Any, sheet: SolutionSheet, found: AgentsNeeded) -> None:

@@ -120,16 +120,17 @@ def _fitting(table: Table, room: int) -> Table:
         return table
     names = [column.removeprefix(f"{table.over}=") for column in table.columns]
     n = len(table.keys)
+    rows = tuple((*row[:n], name, row[n + i]) for row in table.rows for i, name in enumerate(names))
+    each = replace(table, keys=(*table.keys, table.over), columns=("value",), rows=rows)
+    if len({row[0] for row in table.rows}) < len(table.rows):
+        return each
     turned = replace(
         table,
         keys=(table.over,),
         columns=tuple(f"{table.keys[0]}={row[0]}" if n == 1 else row[0] for row in table.rows),
         rows=tuple((name, *(row[n + i] for row in table.rows)) for i, name in enumerate(names)),
     )
-    if _total(turned) <= room:
-        return turned
-    rows = tuple((*row[:n], name, row[n + i]) for row in table.rows for i, name in enumerate(names))
-    return replace(table, keys=(*table.keys, table.over), columns=("value",), rows=rows)
+    return turned if _total(turned) <= room else each
 
 
 def _total(table: Table) -> int:

@@ -6,11 +6,13 @@ Whether the numbers fit together (shapes, definiteness, probabilities) is checke
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Strict, Tag, ValidationError
+from pydantic.fields import FieldInfo
 
 from stochfuse.errors import Problem, nearest
 from stochfuse.kalman.checks import shown
@@ -421,6 +423,40 @@ def keys_of(structure: type[BaseModel], path: Sequence[Any]) -> list[str]:
             return []
         structure = inside[0]
     return [field.alias or name for name, field in structure.model_fields.items()]
+
+
+def fields_at(structure: type[BaseModel], path: Sequence[str | int]) -> list[FieldInfo]:
+    """Fields that a path within a structure may lead to; none where there is no such key."""
+    tables, found = [structure], []
+    for part in path:
+        if isinstance(part, str):
+            found = [
+                field for table in tables for name, field in table.model_fields.items() if (field.alias or name) == part
+            ]
+            tables = [inside for field in found for inside in _tables(field.annotation)]
+    return found
+
+
+def key_paths(structure: type[BaseModel], prefix: str = "") -> list[str]:
+    """Paths of all keys within a structure, lists without their places."""
+    paths = []
+    for name, field in structure.model_fields.items():
+        path = f"{prefix}{field.alias or name}"
+        paths += [path, *(key for inside in _tables(field.annotation) for key in key_paths(inside, f"{path}."))]
+    return paths
+
+
+_SYMBOL = r"(dBm|dBi|dB|MHz|kHz|Hz|rad|deg|mg|km|cm|mm|ms|min|steps|m|s|g|h|°)[²³]?"
+_UNIT = re.compile(rf"√?{_SYMBOL}(/√?{_SYMBOL})*")
+
+
+def unit(field: FieldInfo) -> str:
+    """Unit of a key: from its metadata, else as its description names it (`…, °/h`, `… in rad`, `… [dBm]`)."""
+    extra = field.json_schema_extra
+    if isinstance(extra, dict) and isinstance(extra.get("unit"), str):
+        return str(extra["unit"])
+    pieces = re.split(r"[,;()\[\]]| in | above ", field.description or "")
+    return next((piece.strip() for piece in pieces if _UNIT.fullmatch(piece.strip())), "")
 
 
 def _tables(annotation: Any) -> list[type[BaseModel]]:

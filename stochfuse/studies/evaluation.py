@@ -20,12 +20,13 @@ from stochfuse.prediction.predict import WORTHLESS, predict_items, predict_sever
 from stochfuse.prediction.result import Prediction
 from stochfuse.questions.messages import message_load
 from stochfuse.scenario.network import restricted, uniform_rows
+from stochfuse.scenario.over import LINK, put
 from stochfuse.scenario.registry import LFG, MONTE_CARLO, NAIVE, NATURES, OPTIMAL, STAND_ALONE
 from stochfuse.scenario.scenario import Scenario
 from stochfuse.scenario.system import Items, Noises
-from stochfuse.studies.plan import ERROR, MESSAGES, NODES, SETTINGS, Plan, default_method, put
+from stochfuse.studies.plan import ERROR, MESSAGES, NODES, SETTINGS, Plan, default_method
 
-LINK, Q, R, P0 = "network.link", "model.Q", "model.R", "initial.P"
+Q, R, P0 = "model.Q", "model.R", "initial.P"
 BATCHED = (LINK, Q, R, P0)
 """Keys whose numbers make a batch; a noise's number is that multiple of the identity."""
 PEDIGREES = (LFG, OPTIMAL)

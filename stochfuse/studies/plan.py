@@ -8,7 +8,6 @@ are points.  Points are made in chunks, so that no study has to fit in memory; a
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -17,13 +16,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import ConfigDict, Field, Strict
 
-from stochfuse.errors import Problem, ScenarioError
 from stochfuse.kalman.checks import LARGEST, shown
 from stochfuse.kalman.metrics import Metric
 from stochfuse.kalman.metrics import metric as metric_of
 from stochfuse.prediction.quantities import noun
 from stochfuse.prediction.quantities import unit as unit_of
 from stochfuse.scenario.checker import Checker
+from stochfuse.scenario.over import put
 from stochfuse.scenario.registry import (
     CRITERIA,
     ESTIMATORS,
@@ -268,7 +267,6 @@ def _is_number(value: Any) -> bool:
 
 SETTINGS = ("method", "estimator", "criterion", "runs", "seed", "max_graphs", "prune")
 """Names in [vary] that are no scenario keys."""
-KEY = "a key of the scenario such as network.link or agent[2].R (of the second agent table)"
 MESSAGES, NODES = "messages", "messages.nodes"
 ERROR = ".standard_error"
 CHUNK = {SIMPLIFIED: 16384, GENERAL: 256, NAIVE: 256, OPTIMAL: 256, MONTE_CARLO: 4}
@@ -412,44 +410,3 @@ def default_method(scenario: Scenario, given: set[str]) -> str:
     if scenario.method is not None:
         return scenario.method
     return MONTE_CARLO if "runs" in given else GENERAL if "estimator" in given else SIMPLIFIED
-
-
-_LIKELIHOODS = ("link", "burst", "radio")
-"""Keys of [network] that say how likely messages are."""
-
-
-def put(mapping: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a scenario's mapping with values at paths, `network.link` or `agent[2].R`, less what they replace."""
-    found = json.loads(json.dumps(mapping))
-    for path, value in values.items():
-        *tables, last = _parts(path)
-        place: Any = found
-        for part in tables:
-            place = _entered(path, place, part)
-        if not isinstance(place, dict) or not isinstance(last, str):
-            raise _nowhere(path)
-        place[last] = value
-        # what says how likely messages are takes the place of everything else that does
-        table, _, key = path.partition(".")
-        key = key.partition(".")[0]
-        if table == "network" and key in _LIKELIHOODS:
-            for other in (*_LIKELIHOODS, "case"):
-                if other != key:
-                    found["network"].pop(other, None)
-    return found
-
-
-def _parts(path: str) -> list[str | int]:
-    return [key or int(place) - 1 for place, key in re.findall(r"\[([0-9]+)\]|([^.\[\]]+)", path)]
-
-
-def _entered(path: str, place: Any, part: str | int) -> Any:
-    if isinstance(part, str) and isinstance(place, dict):
-        return place.setdefault(part, {})
-    if isinstance(part, int) and isinstance(place, list) and 0 <= part < len(place):
-        return place[part]
-    raise _nowhere(path)
-
-
-def _nowhere(path: str) -> ScenarioError:
-    return ScenarioError("study", [Problem(f"vary.{path}", KEY, shown(path))])

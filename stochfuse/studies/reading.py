@@ -25,7 +25,6 @@ Whether the values of a key fit the scenario is found out point by point; here, 
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping
 from functools import lru_cache
 from math import prod
@@ -42,14 +41,14 @@ from stochfuse.kalman.metrics import metric as metric_of
 from stochfuse.prediction.quantities import QUANTITIES
 from stochfuse.prediction.quantities import check as check_quantity
 from stochfuse.scenario.checker import Checker
+from stochfuse.scenario.over import KEY, PATH, put
 from stochfuse.scenario.registry import CRITERIA, ESTIMATORS, METHODS
 from stochfuse.scenario.scenario import Scenario, folder_of, is_preset, parse, read_file, read_text, with_links
 from stochfuse.scenario.schema import problems_of, structure_problems
-from stochfuse.studies.plan import EXPECTED, KEY, MESSAGES, SETTINGS, Axis, Plan, StudyFile, put, read_axes
+from stochfuse.studies.plan import EXPECTED, MESSAGES, SETTINGS, Axis, Plan, StudyFile, read_axes
 
 _WORDS = {"method": METHODS, "estimator": ESTIMATORS, "criterion": CRITERIA}
 _LEAST = {"runs": 2, "seed": 0, "max_graphs": 1}
-_PATH = re.compile(r"[^.\[\]]+(\[[1-9][0-9]{0,8}\])?(\.[^.\[\]]+(\[[1-9][0-9]{0,8}\])?)*")
 MOST_POINTS = 1_000_000_000
 MOST_DRAWN = 20_000_000
 """Numbers of a Latin hypercube, points times keys."""
@@ -193,7 +192,7 @@ def _check_settings(check: Checker, axes: tuple[Axis, ...]) -> None:
         elif axis.name == "prune":
             if not all(isinstance(v, bool) for v in axis.given or (axis.low,)):
                 check.note(path, "true or false", shown((axis.given or (axis.low,))[0]))
-        elif "." not in axis.name or not _PATH.fullmatch(axis.name):
+        elif "." not in axis.name or not PATH.fullmatch(axis.name):
             check.note(path, f"{KEY}, or one of {', '.join(SETTINGS)}", f"'{axis.name}'")
 
 
@@ -227,7 +226,7 @@ def _example(name: str, base: Mapping[str, Any], axes: tuple[Axis, ...]) -> Scen
     try:
         problems = structure_problems(put(base, first))
     except ScenarioError as error:
-        raise ScenarioError(name, error.problems) from None
+        raise ScenarioError(name, [_varied(problem, first) for problem in error.problems]) from None
     if problems:
         raise ScenarioError(name, [_varied(problem, first) for problem in problems])
     failed: StochfuseError | None = None

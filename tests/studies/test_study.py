@@ -12,9 +12,9 @@ import pyarrow.parquet as pq
 import pytest
 
 import stochfuse as sf
+from stochfuse.scenario.over import put
 from stochfuse.studies import evaluation
 from stochfuse.studies.files import packed, unpacked
-from stochfuse.studies.plan import put
 from stochfuse.studies.reading import load_study, plan_of
 
 THREE = {"network.link": [0.0, 0.3, 1.0], "model.R": [1.0, 100.0], "network.agents": [2, 3]}
