@@ -70,7 +70,6 @@ def predict(
     *,
     steady: bool = False,
     interval: float | str | None = None,
-    interval: float | str | None = None,
     over: None = None,
     **settings: Any,
 ) -> Prediction: ...
