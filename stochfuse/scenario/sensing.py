@@ -427,7 +427,7 @@ def _refuse(check: Checker, path: str, table: Mapping[str, Any], keys: Sequence[
 def _read(check: Checker, path: str, table: Mapping[str, Any], given: _Given) -> _Read | None:
     """Read one sensor's table."""
     if table.get("kind") is None:
-        check.missing(f"{path}.kind", "one of " + ", ".join(f'"{known}"' for known in KINDS))
+        check.note(f"{path}.kind", "one of " + ", ".join(f'"{known}"' for known in KINDS), "nothing")
     kind = check.choice(f"{path}.kind", table.get("kind"), tuple(KINDS))
     due = _due(check, path, table, given.steps)
     detection = _detection(check, f"{path}.detection", table.get("detection"), given.steps)
@@ -478,7 +478,7 @@ def _noise(check: Checker, path: str, value: Any, kind: str, axes: int) -> np.nd
     if p > 1 and len(set(units)) == 1:
         expected = f"a standard deviation above 0 in {units[0]}, or a list of {p}"
     if value is None:
-        check.missing(path, expected)
+        check.note(path, expected, "nothing")
         return None
     sigma = check.array(path, value, expected)
     if sigma is None:
@@ -548,12 +548,12 @@ def _placed(check: Checker, path: str, position: Any, read: _Read, given: _Given
         if path == "agent":
             check.note(path, f"one [[agent]] table with a position for each, where {read.path} is", "nothing")
         else:
-            check.missing(f"{path}.position", f"the place of its sensor, {axes} or as many per step")
+            check.note(f"{path}.position", f"the place of its sensor, {axes} or as many per step", "nothing")
         return None
     if read.looks and not given.nominal:
         if not any(problem.path == "model.nominal" for problem in check.problems):
             expected = f"a nominal path (position, velocity), about which {read.path} ({read.kind}) is linearised"
-            check.missing("model.nominal", expected)
+            check.note("model.nominal", expected, "nothing")
         return None
     course = given.course
     if course is None or (read.looks and (place is None or given.path is None)):
