@@ -22,14 +22,9 @@ class Checker:
         self._skip = skip
 
     def note(self, path: str, expected: str, got: str) -> None:
-        """Remember one problem, the first that is found of a path: several readers may look at one."""
-        if all(problem.path != path for problem in self.problems):
+        """Remember one problem, unless something is known to be wrong there already."""
+        if path not in self._skip and all(problem.path != path for problem in self.problems):
             self.problems.append(Problem(path, expected, got))
-
-    def missing(self, path: str, expected: str) -> None:
-        """Remember that something is not there, unless that is known already."""
-        if path not in self._skip:
-            self.note(path, expected, "nothing")
 
     def array(self, path: str, value: Any, expected: str) -> np.ndarray | None:
         """Any array of finite floats."""

@@ -276,7 +276,7 @@ def read_step(check: Checker, table: Mapping[str, Any], steps: int) -> np.ndarra
 def _noise(check: Checker, value: Any) -> float | None:
     expected = "a density (continuous) or a standard deviation (piecewise) of at least 0"
     if value is None:
-        check.missing("model.noise", expected)
+        check.note("model.noise", expected, "nothing")
         return None
     noise = check.array("model.noise", value, expected)
     if noise is None:
@@ -295,7 +295,7 @@ def _turn_rate(check: Checker, kind: str | None, value: Any, steps: int) -> np.n
         return np.zeros(())
     expected = "the turn rate in rad/s, or one per step"
     if value is None:
-        check.missing("model.turn_rate", expected)
+        check.note("model.turn_rate", expected, "nothing")
         return None
     rate = check.series("model.turn_rate", value, expected, steps)
     if rate is not None and (np.abs(rate) > LONGEST).any():
@@ -351,7 +351,7 @@ def _nominal(check: Checker, table: Any, model: Model, layout: Layout, T: np.nda
     if not isinstance(table, Mapping):
         return None
     if table.get("position") is None:
-        check.missing("model.nominal.position", f"{layout.axes} coordinates at step 1, or as many per step")
+        check.note("model.nominal.position", f"{layout.axes} coordinates at step 1, or as many per step", "nothing")
     place = check.vector("model.nominal.position", table.get("position"), layout.axes, steps)
     each = steps if place is not None and place.ndim == 3 else None
     rest = {"velocity": layout.velocity, "acceleration": layout.acceleration}

@@ -447,7 +447,8 @@ def _root(key: str, variance: Any) -> Any:
     """Standard deviation of a variance; a negative one is left for the reading to refuse."""
     if not isinstance(variance, int | float):
         raise UsageError(f"{key}: expected a variance, in the place of a standard deviation, got {shown(variance)}")
-    return float(variance) ** 0.5 if variance >= 0 else variance
+    number = float(variance)
+    return number**0.5 if number >= 0 else number
 
 
 def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> Scenario:

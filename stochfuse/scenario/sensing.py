@@ -448,7 +448,7 @@ def _read(check: Checker, path: str, table: Mapping[str, Any], given: _Given) ->
     """Read one sensor's table."""
     if table.get("kind") is None:
         expected = "one of " + ", ".join(f'"{known}"' for known in KINDS)
-        check.missing(f"{path}.kind", f"{expected}, or H and R with {', '.join(SOMETIMES)} alone")
+        check.note(f"{path}.kind", f"{expected}, or H and R with {', '.join(SOMETIMES)} alone", "nothing")
     kind = check.choice(f"{path}.kind", table.get("kind"), tuple(KINDS))
     due = _due(check, path, table, given.steps)
     detection = _detection(check, f"{path}.detection", table.get("detection"), given.steps)
@@ -456,7 +456,7 @@ def _read(check: Checker, path: str, table: Mapping[str, Any], given: _Given) ->
     if kind is None or layout is None:
         return None
     if table.get("sigma") is None:
-        check.missing(f"{path}.sigma", f'standard deviations of a "{kind}"')
+        check.note(f"{path}.sigma", f'standard deviations of a "{kind}"', "nothing")
     R = _noise(check, f"{path}.sigma", table.get("sigma"), kind, layout.axes)
     reach = _above_zero(check, f"{path}.range", table.get("range"), "a distance above 0 in m", LARGEST)
     width = _above_zero(
@@ -501,7 +501,7 @@ def _noise(check: Checker, path: str, value: Any, kind: str, axes: int) -> np.nd
     if p > 1 and len(set(units)) == 1:
         expected = f"a standard deviation above 0 in {units[0]}, or a list of {p}"
     if value is None:
-        check.missing(path, expected)
+        check.note(path, expected, "nothing")
         return None
     sigma = check.array(path, value, expected)
     if sigma is None:
@@ -571,12 +571,12 @@ def _placed(check: Checker, path: str, position: Any, read: _Read, given: _Given
         if path == "agent":
             check.note(path, f"one [[agent]] table with a position for each, where {read.path} is", "nothing")
         else:
-            check.missing(f"{path}.position", f"the place of its sensor, {axes} or as many per step")
+            check.note(f"{path}.position", f"the place of its sensor, {axes} or as many per step", "nothing")
         return None
     if read.looks and not given.nominal:
         if not any(problem.path == "model.nominal" for problem in check.problems):
             expected = f"a nominal path (position, velocity), about which {read.path} ({read.kind}) is linearised"
-            check.missing("model.nominal", expected)
+            check.note("model.nominal", expected, "nothing")
         return None
     course = given.course
     if course is None or (read.looks and (place is None or given.path is None)):

@@ -172,6 +172,7 @@ def test_scenario_commands(tmp_path):
         "parallel-filters",
         "thesis-steady",
         "thesis-transient",
+        "two-radars",
     ]
     assert "fcs-demo" in run("scenario", "list").stdout
     assert (
