@@ -110,7 +110,9 @@ def worst_error(A, R, D):
     With A R Aᵀ = L Lᵀ, A D Aᵀ = M Mᵀ and LᵀM = U Σ Vᵀ: of L w + M V Uᵀ w with white w, trace tr A(R + D)Aᵀ + 2 tr Σ.
     """
     # the square root of a zero's rounding would be no rounding
-    roots = (U * np.sqrt(np.where(values > 1e-14 * values.max(), values, 0.0)) for values, U in map(np.linalg.eigh, (R, D)))
+    roots = (
+        U * np.sqrt(np.where(values > 1e-14 * values.max(), values, 0.0)) for values, U in map(np.linalg.eigh, (R, D))
+    )
     L, M = (A @ root for root in roots)
     U, _, Vt = np.linalg.svd(L.T @ M)
     together = L + M @ Vt.T @ U.T
