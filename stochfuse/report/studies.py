@@ -176,7 +176,7 @@ def summarise(results: Results) -> Summary:
                 i = int((np.abs(values - end) <= ROUNDING * np.abs(end)).argmax())
                 if best is None or sign * (best.value - values[i]) > ROUNDING * abs(best.value):
                     at, how = ({name: plain(block[name][i]) for name in names} for names in (keys, HOW))
-                    point, step = (int(block[name][i]) for name in ("point", "step"))
+                    point, step = int(block["point"][i]), int(block["step"][i])
                     found[column, extreme] = Extreme(column, extreme, float(values[i]), point, step, at, how)
     order = [(column, extreme) for column in plan.columns for extreme in ("least", "greatest")]
     return Summary(tuple(found[at] for at in order if at in found), dict(sorted(natures.items())))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import stochfuse as sf
+from stochfuse.errors import ScenarioError
 from stochfuse.estimators.fusion_graph import FusionGraph, History, Message, load_history
 from stochfuse.report import fusion_graph as report
 from stochfuse.report.plot import save
@@ -253,6 +254,20 @@ def test_dot_and_json_name_every_node_and_edge(example):
     assert "n2_2 -> fused [style=dashed];" in dot
     assert dot.count('fillcolor="#f4b183"') == 3
     assert "n1_4" not in dot  # agent 1's last estimate is not in agent 3's pedigree
+
+
+def test_a_graph_explains_and_draws_itself(example):
+    graph = example[0]
+    assert graph.text(1, 4) == report.to_text([graph.explain(1, 4)])
+    title = graph.plot(agent=1, step=4).axes[0].get_title()
+    assert title == "Local fusion graph of agent 1 after step 4"
+
+
+def test_a_history_may_be_a_mapping():
+    given = {"agents": 2, "steps": 1, "message": [{"from": 2, "to": 1, "sent": 1}]}
+    assert load_history(given).messages == (Message(2, 1, 1, 1),)
+    with pytest.raises(ScenarioError, match="agents: expected a whole number of at least 1, got nothing"):
+        load_history({"steps": 1})
 
 
 def test_figure_of_a_graph(example, tmp_path):

@@ -425,5 +425,10 @@ def test_everything_goes_into_a_directory(tmp_path, monkeypatch):
     assert strict_json((tmp_path / "figure-48.json").read_text())["statements"]
 
 
+def test_the_room_is_a_door():
+    assert sf.thesis.Bench is Bench
+    assert sf.thesis.statements() == statements()
+
+
 def test_architectures_are_those_of_the_thesis():
     assert ARCHITECTURES == ("ad-hoc", "broadcast", "cyclic")
