@@ -43,8 +43,8 @@ from stochfuse.prediction.boundedness import (
     recursions,
     stable,
 )
-from stochfuse.prediction.result import Result
 from stochfuse.scenario.network import LinkRows, restricted, stacked_rows
+from stochfuse.scenario.result import Result
 from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario
 from stochfuse.scenario.system import Items
 

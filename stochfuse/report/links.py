@@ -157,11 +157,15 @@ def links_csv(found: Links) -> str:
 
 
 def arrays(found: Links) -> dict[str, Any]:
-    """Return what an xarray.Dataset takes: (receiver, sender) arrays of all that is known, NaN where nothing is."""
+    """Return what an xarray.Dataset takes: (receiver, sender) arrays of all that is known, NaN where nothing is.
+
+    Where links vary the step stands in front.
+    """
     known = {name: getattr(found, name) for name in ("link", "low", "high", "sent", "received", "memory")}
+    steps = {"step": range(1, len(found.link) + 1)} if found.varies else {}
     return {
-        "data_vars": {name: (NAMES, M) for name, M in known.items() if M is not None},
-        "coords": {name: list(found.nodes) for name in NAMES},
+        "data_vars": {name: (("step", *NAMES)[3 - M.ndim :], M) for name, M in known.items() if M is not None},
+        "coords": {**steps, **{name: list(found.nodes) for name in NAMES}},
         "attrs": {"source": found.source, "kind": found.kind},
     }
 

@@ -31,7 +31,7 @@ import numpy as np
 from stochfuse.errors import Problem, ScenarioError, UsageError, needed
 from stochfuse.kalman.checks import shown
 from stochfuse.scenario.links import Links, as_network, links_of_table
-from stochfuse.scenario.scenario import Scenario, as_file
+from stochfuse.scenario.scenario import Scenario, all_names, as_file
 
 Edge = tuple[int, int]
 """Receiver and sender, from 0."""
@@ -79,7 +79,7 @@ def scenario(
         if "agent" in given:
             raise ScenarioError(name, [Problem("agent", "nothing beside a list of agents", "a list")])
         given["agent"], agents = list(agents), len(agents)
-    given["network"] = _network(network, agents, name)
+    given["network"] = _network(network, agents, all_names(given.get("agent")), name)
     if model is not None:
         given["model"] = model
     if initial is not None:
@@ -87,7 +87,7 @@ def scenario(
     return Scenario.from_mapping(given, name)
 
 
-def _network(network: Any, agents: Any, name: str) -> Any:
+def _network(network: Any, agents: Any, nodes: Sequence[str] | None, name: str) -> Any:
     """[network] with the number of agents, and with links that are known as numbers."""
     if network is not None and not isinstance(network, Mapping):
         return network
@@ -99,6 +99,8 @@ def _network(network: Any, agents: Any, name: str) -> Any:
         link = links_of_table(link)
     if not isinstance(link, Links):
         return found
+    if nodes is not None:
+        found.setdefault("nodes", nodes)
     return as_network(link, as_file(found, name), name, silent=found.get("architecture", "ad-hoc") == "ad-hoc")
 
 

@@ -235,12 +235,12 @@ def with_links(mapping: Any, name: str, folder: Path) -> Any:
     except UsageError as error:
         raise ScenarioError(name, [Problem("network.link.file", "a file of links", f"({error})")]) from None
     found = replace(found, source=given["file"])
-    nodes = network.get("nodes") or _all_names(mapping.get("agent"))
+    nodes = network.get("nodes") or all_names(mapping.get("agent"))
     network = network if nodes is None else {**network, "nodes": nodes}
     return {**mapping, "network": as_network(found, network, name, "network.link.file")}
 
 
-def _all_names(tables: Any) -> list[str] | None:
+def all_names(tables: Any) -> list[str] | None:
     """Names of [[agent]] tables that all have one."""
     listed = tables if isinstance(tables, list) else []
     given = [table.get("name") for table in listed if isinstance(table, Mapping)]

@@ -48,7 +48,7 @@ def test_the_door_is_there_before_and_after_imports(first):
         "s = sf.scenario(model=dict(F=1, H=1, Q=25, R=100), initial=100, network=dict(agents=3, steps=2))\n"
         "import stochfuse.scenario.links, stochfuse.scenario.scenario\n"
         "from stochfuse import scenario\n"
-        "assert stochfuse.scenario.links.links is sf.links\n"
+        "assert stochfuse.scenario.links.Links is type(sf.links('road-5'))\n"
         "assert isinstance(s, stochfuse.scenario.scenario.Scenario)\n"
         "assert callable(sf.scenario) and sf.scenario is stochfuse.scenario is scenario\n"
     )
@@ -138,11 +138,21 @@ def test_links_of_a_log_are_taken_with_their_names_and_what_is_unknown_is_not_he
     p = sf.predict(sf.scenario(MODEL, network={"steps": 3, "link": found}, initial=P0), interval=0.95)
     assert (p.low() < p.values()).all()
     assert (p.values() < p.high()).all()
+    named = [{"name": "c"}, {"name": "b", "R": 9.0}]
+    assert sf.scenario(MODEL, named, {"steps": 3, "link": found}, P0).network.names == ("c", "b")
     two = sf.scenario(MODEL, network={"steps": 3, "link": found, "nodes": ["b", "a"]}, initial=P0)
     assert two.network.agents == 2
     assert two.network.hears is None
     delayed = sf.links({**LOG, "sent_time": LOG["seq"], "received_time": [k + 1.5 for k in LOG["seq"]]}, step=1.0)
     assert sf.scenario(MODEL, network={"steps": 3, "link": delayed}, initial=P0).network.delay == (0.0, 1.0)
+
+
+def test_links_of_another_scenario_are_taken_step_by_step():
+    road = sf.links("road-5")
+    s = sf.scenario(MODEL, network={"steps": 4, "link": road}, initial=P0)
+    np.testing.assert_array_equal(s.network.link, np.nan_to_num(road.link[:4]))
+    with pytest.raises(sf.ScenarioError, match=r"network.link: expected one probability for each link, got bursts or"):
+        sf.scenario(MODEL, network={"steps": 2, "link": sf.links("fcs-demo")}, initial=P0)
 
 
 @pytest.mark.parametrize(
