@@ -169,7 +169,9 @@ def test_scenario_commands(tmp_path):
         "cv-2d",
         "fcs-demo",
         "gps-ins",
+        "orbit-8",
         "parallel-filters",
+        "road-5",
         "thesis-steady",
         "thesis-transient",
     ]
