@@ -36,7 +36,6 @@ QUESTION = "Options"
 EXAMPLES = (
     "stochfuse solve --target 30 --method general",
     "stochfuse solve --target 25 --agents-needed --link 0.5",
-    "stochfuse solve --target 30 --over model.R=50:200 --link 0.5",
 )
 
 NOT_CRITICAL = ("target", "agents-needed", "sensitivity", "gain", "steady", "over")

@@ -249,8 +249,10 @@ def unit_of(name: str) -> str:
     if not found:
         known = key_paths(ScenarioFile)
         plain = re.sub(r"\[[0-9]+\]", "", name)
+        same = [path for path in known if path.lower() == plain.lower()]
         ends = [path for path in known if path.rpartition(".")[2] == plain.rpartition(".")[2]]
-        near = nearest(plain, known) or (f" (did you mean '{ends[0]}'?)" if ends else "")
+        first = next(iter(same or ([] if nearest(plain, known) else ends)), None)
+        near = f" (did you mean '{first}'?)" if first else nearest(plain, known)
         raise UsageError(f"over: expected {KEY}, got '{name}'{near}")
     return next(filter(None, map(unit, found)), "")
 
