@@ -63,6 +63,9 @@ def predict(
     steady: Annotated[
         bool, option("Add the steady state, P = g(P), with a proved bound (simplified).", SHOWN, "--steady")
     ] = False,
+    interval: Annotated[
+        str | None, option("Also the interval that the log behind the links supports: 95%.", SHOWN, metavar="P%")
+    ] = None,
     method: MethodOption = None,
     estimator: EstimatorOption = None,
     sampling: Sampling = Sampling(),
@@ -102,7 +105,11 @@ def predict(
         for name in quantities:
             check_statistic(statistic, name, chosen)
     given_settings = {"estimator": estimator, **sampling._asdict(), **graphs._asdict(), **weighing._asdict()}
-    settings = {"steady": steady, "over": swept, **settings_for([way], **given_settings)}
+    if interval is not None:
+        for flag, given_too in (("--normalise", normalise), ("--statistic", statistic != "mean"), ("--over", swept)):
+            if given_too:
+                raise UsageError(f"{flag}: expected without --interval")
+    settings = {"steady": steady, "over": swept, "interval": interval, **settings_for([way], **given_settings)}
     if swept and statistic != "mean":
         settings["one_by_one"] = True  # whose outcomes are kept
     if normalise and swept and any(key.name == PLACES["link"] for key in swept.keys):

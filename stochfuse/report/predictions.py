@@ -108,6 +108,13 @@ class PredictionView:
             return None if errors is None else self._at(errors)
         return self._at(self._normalised(errors, self.baseline.values(self.metric, self.agent)))
 
+    def ends(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Low and high end of the values as a log supports them, each (links, steps); None if not asked for."""
+        if isinstance(self.prediction, Swept):
+            return None
+        found = self.prediction.interval(self.metric, self.agent)
+        return None if found is None else (self._at(found[0]), self._at(found[1]))
+
     def values(self) -> np.ndarray:
         """Values shown, shape (links, steps)."""
         if self.prediction.meta.get("faults"):  # items without an answer stay what they are
@@ -221,7 +228,16 @@ class PredictionView:
         natures = list(dict.fromkeys(map(self._nature, self.parts)))
         # of many different ones the first and the last
         nature = " … ".join([natures[0], natures[-1]] if len(natures) > 1 else natures)
-        return f"{method_title(p.method, p.estimator)}; {nature}"
+        return f"{method_title(p.method, p.estimator)}; {nature}{self._supported}"
+
+    @property
+    def _supported(self) -> str:
+        """What an interval is, in words."""
+        if isinstance(self.prediction, Swept) or self.prediction.supported is None:
+            return ""
+        posterior, _ = self.prediction.supported
+        by = f"{len(posterior.rows.link):,} draws of the links" if posterior.drawn else "derivatives in the links"
+        return f"; [ ]: {100 * posterior.level:.6g} % interval for what the log leaves unknown, by {by}"
 
     def _nature(self, p: Prediction) -> str:
         """How exact the values are, in words."""
@@ -260,16 +276,22 @@ def report(views: Sequence[PredictionView]) -> Report:
 
 def predict_table(view: PredictionView) -> Table:
     """Return rows of link probabilities (or cases) against columns of steps."""
-    values, errors, steady = view.values(), view.errors(), view.steady()
+    values, errors, steady, ends = view.values(), view.errors(), view.steady(), view.ends()
     columns = [f"k={k}" for k in view.steps] + (["steady"] if steady is not None else [])
     rows = []
     for i, there in enumerate(view.there):
         shown = [number(v, view.digits) for v in values[i]]
         if errors is not None:
             shown = [f"{value} ±{error:.2g}" for value, error in zip(shown, errors[i], strict=True)]
+        if ends is not None:
+            shown = [f"{value} {_between(*pair, view.digits)}" for value, *pair in zip(shown, *(e[i] for e in ends))]  # noqa: B905
         shown = [value if is_there else "" for value, is_there in zip(shown, there, strict=True)]
         rows.append((*view.rows.cells(i), *shown, *([] if steady is None else [number(steady[i], view.digits)])))
     return Table((view.what, view.whom, view.how), view.rows.keys, tuple(columns), tuple(rows), over="k")
+
+
+def _between(low: float, high: float, digits: int) -> str:
+    return f"[{number(low, digits)}, {number(high, digits)}]"
 
 
 def listed(values: np.ndarray) -> Any:
@@ -289,16 +311,18 @@ def predict_csv(view: PredictionView) -> str:
     metric = view.metric.name + ("/at-link-0" if view.baseline else "")
     metric = metric if view.statistic == "mean" else f"{view.statistic}({metric})"
     labels = (p.method, p.quantity, p.stage, p.nature, metric, view.unit, view.agent)
-    rows = []
+    rows, ends = [], view.ends()
     for i, there in enumerate(view.there):
         label = (*labels, *view.rows.record(i))
-        error = [()] * len(there) if errors is None else [(float(e),) for e in errors[i]]
+        error: list[Any] = [()] * len(there) if errors is None else [(float(e),) for e in errors[i]]
+        if ends is not None:
+            error = [(float(low), float(high)) for low, high in zip(ends[0][i], ends[1][i], strict=True)]
         rows += [(*label, int(view.steps[c]), float(values[i, c]), *error[c]) for c in np.flatnonzero(there)]
         if steady is not None:
             rows.append((*label, "steady", float(steady[i])))
     what = ("method", "quantity", "stage", "nature", "metric", "unit", "agent")
-    headings = (*what, *view.rows.headings, "step", "value")
-    return to_csv(headings if errors is None else (*headings, "standard_error"), rows)
+    more = ("standard_error",) if errors is not None else ("low", "high") if ends is not None else ()
+    return to_csv((*what, *view.rows.headings, "step", "value", *more), rows)
 
 
 def predict_json(view: PredictionView) -> dict[str, Any]:
@@ -332,7 +356,9 @@ def predict_json(view: PredictionView) -> dict[str, Any]:
     }
     if view.statistic != "mean":
         result["statistic"] = view.statistic
-    errors = view.errors()
+    errors, ends = view.errors(), view.ends()
+    if ends is not None and isinstance(p, Prediction) and p.supported is not None:
+        result |= {"low": listed(ends[0]), "high": listed(ends[1]), "level": p.supported[0].level}
     if errors is not None:
         half = WIDTH_95 * errors
         result["standard_error"] = listed(errors)
@@ -360,12 +386,15 @@ RATIO = "actual / claimed"
 def side_table(views: Sequence[PredictionView]) -> Table:
     """Return rows of link probability and step, columns of quantities."""
     values, errors = [view.values() for view in views], [view.errors() for view in views]
-    rows, names = [], views[0].rows
+    ends = [view.ends() for view in views]
+    rows, names, digits = [], views[0].rows, views[0].digits
     for i, there in enumerate(views[0].there):
         for k in np.flatnonzero(there):
             cells = [
-                number(value[i, k], views[0].digits) + ("" if error is None else f" ±{error[i, k]:.2g}")
-                for value, error in zip(values, errors, strict=True)
+                number(value[i, k], digits)
+                + ("" if error is None else f" ±{error[i, k]:.2g}")
+                + ("" if end is None else f" {_between(end[0][i, k], end[1][i, k], digits)}")
+                for value, error, end in zip(values, errors, ends, strict=True)
             ]
             rows.append((*names.cells(i), str(views[0].steps[k]), *cells))
     keys = (*names.keys, "k")
@@ -383,7 +412,7 @@ def side_csv(views: Sequence[PredictionView]) -> str:
 def side_json(views: Sequence[PredictionView]) -> dict[str, Any]:
     """Return the object of the first quantity, with all of them under `quantities`."""
     each = {view.prediction.quantity: predict_json(view) for view in views}
-    kept = ("values", "standard_error", "interval", "bernstein")
+    kept = ("values", "standard_error", "interval", "low", "high", "level", "bernstein")
     return {
         **each[views[0].prediction.quantity],
         "quantities": {
@@ -445,7 +474,7 @@ def draw(view: PredictionView):
     figure = figure_class()(figsize=(7.5, 5.0), layout="constrained")
     at = draw_on(figure.add_subplot(), view)
     bars = "; bands: 95 % confidence" if view.sampled else ""
-    titled(figure, view.what + (f", {at}" if at else ""), view.whom, view.how + bars)
+    titled(figure, view.what + (f", {at}" if at else ""), view.whom, view.how.replace("; [ ]:", "; band:") + bars)
     return figure
 
 
@@ -488,7 +517,7 @@ def _curve(
     **style: Any,
 ) -> Any:
     """Draw one curve: a line, the asked points, a band."""
-    values, errors, x = view.values(), view.errors(), curves.x[c]
+    values, errors, ends, x = view.values(), view.errors(), view.ends(), curves.x[c]
     y = values[curves.picks[c]]
     few = len(x) <= 30
     if fine is None:
@@ -499,6 +528,9 @@ def _curve(
     if errors is not None:
         reach = WIDTH_95 * errors[curves.picks[c]]
         axes.fill_between(x, y - reach, y + reach, color=style["color"], alpha=0.2, linewidth=0)
+    if ends is not None:
+        low, high = (end[curves.picks[c]] for end in ends)
+        axes.fill_between(x, low, high, color=style["color"], alpha=0.2, linewidth=0)
     return line
 
 

@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import beta
 
 import stochfuse as sf
+from tests.cli.command import run, strict_json
 from tests.oracles import featured
 
 TRUE = np.array([[0.0, 0.7, 0.4], [0.8, 0.0, 0.9], [0.5, 0.6, 0.0]])
@@ -115,3 +116,34 @@ def test_what_an_interval_needs():
     with pytest.raises(sf.UsageError, match="broadcast"):
         sf.predict(counted(np.random.default_rng(1), 50, np.full((2, 2), 1.0), architecture="broadcast"), interval=0.95)
     assert sf.predict(s).interval() is None
+
+
+def test_the_command_line_shows_both_ends(tmp_path):
+    rng = np.random.default_rng(2)
+    rows = [f"{k},{s},{r},{int(rng.random() < 0.6)}" for s in "abc" for r in "abc" if s != r for k in range(30)]
+    (tmp_path / "log.csv").write_text("\n".join(["seq,sender,receiver,received", *rows]))
+    text = '[model]\nF = 1\nH = 1\nQ = 1\nR = 1\n[initial]\nP = 1\n[network]\nagents = 3\nsteps = 3\nlink = { file = "log.csv" }\n'
+    (tmp_path / "net.toml").write_text(text)
+    file = tmp_path / "net.toml"
+    found = strict_json(
+        run("predict", file, "--interval", "90%", "--quantity", "claimed,optimal", "--format", "json").stdout
+    )
+    assert found["level"] == 0.9
+    for each in (found, *found["quantities"].values()):
+        low, value, high = (np.array(each[key]) for key in ("low", "values", "high"))
+        assert low.shape == value.shape == (1, 3)
+        assert (low < value).all()
+        assert (value < high).all()
+    table = run("predict", file, "--interval", "0.9", env={"COLUMNS": "80"}).stdout
+    assert "90 % interval for what the log leaves unknown, by 1,000 draws" in " ".join(table.split())
+    assert f"[{found['low'][0][0]:.5g}" in table
+    header, first, *_ = run("predict", file, "--interval", "90%", "--format", "csv").stdout.splitlines()
+    assert header.endswith("step,value,low,high")
+    assert float(first.split(",")[-1]) == pytest.approx(found["high"][0][0])
+    run("predict", file, "--interval", "90%", "--plot", tmp_path / "band.png")
+    for more, message in (
+        (("--normalise",), "--normalise"),
+        (("--over", "model.Q=1,2"), "--over"),
+        (("--link", "0.5"), "own links"),
+    ):
+        assert message in run("predict", file, "--interval", "90%", *more, code=2).stderr
