@@ -109,7 +109,8 @@ def predict(
         for flag, given_too in (("--normalise", normalise), ("--statistic", statistic != "mean"), ("--over", swept)):
             if given_too:
                 raise UsageError(f"{flag}: expected without --interval")
-    settings = {"steady": steady, "over": swept, "interval": interval, **settings_for([way], **given_settings)}
+    asked_for = {"steady": steady, "over": swept} | ({} if interval is None else {"interval": interval})
+    settings = {**asked_for, **settings_for([way], **given_settings)}
     if swept and statistic != "mean":
         settings["one_by_one"] = True  # whose outcomes are kept
     if normalise and swept and any(key.name == PLACES["link"] for key in swept.keys):
