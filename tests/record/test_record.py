@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stochfuse.errors import UsageError
-from tests.record.__main__ import REFUSED_NOW, TOLERANCE, answer, differences, recorded
+from tests.record.__main__ import GROWN, REFUSED_NOW, TOLERANCE, answer, differences, recorded
 from tests.record.calls import calls
 
 PARTS = 8
@@ -17,6 +17,8 @@ PARTS = 8
 def test_answers_are_those_of_0_1(part):
     made, found = calls(), []
     for name, wanted in list(recorded().items())[part::PARTS]:
+        if name in GROWN:
+            continue
         if name in REFUSED_NOW:
             with pytest.raises(UsageError):
                 answer(made[name])
