@@ -142,7 +142,7 @@ def predict(
     >>> p.values().round(3)[:, -1]
     array([39.775, 26.271])
     >>> sf.predict("thesis-transient", [0.5], over={"model.R": [50, 100]}).values().round(3)[:, -1]
-    array([17.191, 26.271])
+    array([16.451, 26.271])
     """
     if over is not None:
         if interval is not None:

@@ -220,13 +220,15 @@ def as_network(
     n, link, hears = len(found.nodes), found.link.copy(), network.get("hears")
     if agents is not None and agents != n:
         raise ScenarioError(name, [Problem("network.agents", f"{n}, the nodes of {found.source}", str(agents))])
-    for i, j in np.argwhere(np.isnan(link)).tolist():
+    if found.steps is not None and (found.burst or found.cases):
+        raise ScenarioError(name, [Problem(key, "one probability for each link", "bursts or cases of a scenario")])
+    for i, j in np.argwhere(np.isnan(link))[:, -2:].tolist():
         if i != j and not (isinstance(hears, list) and i < len(hears) and j + 1 not in (hears[i] or [])):
             expected = "links that are all known, or network.hears without the unknown ones"
             raise ScenarioError(
                 name, [Problem(key, expected, f"nothing known of {found.nodes[j]} to {found.nodes[i]}")]
             )
-        link[i, j] = 0.0
+        link[..., i, j] = 0.0
     made = {**network, "agents": n, "nodes": list(found.nodes), "link": link.tolist()}
     if found.delay is not None:
         made.setdefault("delay", list(found.delay))

@@ -22,6 +22,7 @@ import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, wraps
+from numbers import Real
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
@@ -445,10 +446,10 @@ def _override_noise(mapping: dict[str, Any], entry: str, value: Any) -> None:
 
 def _root(key: str, variance: Any) -> Any:
     """Standard deviation of a variance; a negative one is left for the reading to refuse."""
-    if not isinstance(variance, int | float):
+    if not isinstance(variance, Real):
         raise UsageError(f"{key}: expected a variance, in the place of a standard deviation, got {shown(variance)}")
-    number = float(variance)
-    return number**0.5 if number >= 0 else number
+    value = float(variance)
+    return value**0.5 if value >= 0 else value
 
 
 def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> Scenario:

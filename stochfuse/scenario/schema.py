@@ -482,7 +482,7 @@ def _problem(structure: type[BaseModel], entry: Any) -> Problem:
     elif entry["loc"][-1:] in (("int",), ("float",)):
         expected = _KINDS["float_type"]
     elif entry["loc"][-2:] == _FORMS[0]:
-        expected = "false, or a table"
+        expected = "true, false, or a table"
     else:
         expected = _KINDS.get(kind, str(entry["msg"]))
     if kind == "extra_forbidden":

@@ -579,7 +579,7 @@ WRONG = [
      r"network.hears: expected links without memory \(no burst\), got a burst"),
     (COMMON | {"agent": [{"sensor": False, "H": [[1, 0]]}, {}, {}]},
      r"agent\[1\].H: expected nothing, since sensor = false, got \[\[1, 0\]\]"),
-    (COMMON | {"agent": [{"sensor": 0}, {}, {}]}, r"agent\[1\].sensor: expected true or false, got 0"),
+    (COMMON | {"agent": [{"sensor": 0}, {}, {}]}, r"agent\[1\].sensor: expected true, false, or a table, got 0"),
     (COMMON | {"agent": [{}, {}]}, r"agent: expected one \[\[agent\]\] table for each of the 3 agents, got 2"),
     (COMMON | {"report": {"agent": 4}}, "report.agent: expected an agent from 1 to 3, got 4"),
 ]  # fmt: skip

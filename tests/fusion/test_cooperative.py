@@ -642,7 +642,7 @@ def test_reading_goes_on_past_what_the_schema_has_named():
 def test_coincident_agents_are_named_once_though_each_sees_the_other():
     nodes = [{"position": [1, 1]}] * 3
     named = [problem.split(":")[0] for problem in read(GOOD, nodes)[1]]
-    assert named == ["agent[2].position", "agent[3].position", "agent[3].position"]
+    assert named == ["agent[2].position", "agent[3].position"]
 
 
 @pytest.mark.parametrize(

@@ -507,7 +507,7 @@ WRONG = [
     ({"detection": 1.2}, {}, "agent[1].sensor.detection: expected a probability, or one per step, got 1.2"),
     ({"detection": [0.5]}, {}, "agent[1].sensor.detection: expected one number for each of the 6 steps, got 1 numbers"),
     ({"gain": 3}, {}, "agent[1].sensor.gain: expected a known key, got an unknown one, 'gain'"),
-    ({}, {"agent__0__sensor": 5}, "agent[1].sensor: expected false, or a table, got 5"),
+    ({}, {"agent__0__sensor": 5}, "agent[1].sensor: expected true, false, or a table, got 5"),
     ({}, {"agent__0__sensor": {"sigma": 3}}, "or H and R with period, offset, detection alone, got nothing"),
     ({}, {"agent__0__H": [[1, 0, 0, 0]]}, "agent[1].H: expected nothing beside a sensor by name, got [[1, 0, 0, 0]]"),
     ({}, {"agent__0__R": 4}, "agent[1].R: expected nothing beside a sensor by name, got 4"),
