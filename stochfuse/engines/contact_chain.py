@@ -570,7 +570,8 @@ def _grown(
 def check_size(paths: float, numbers: float = 0.0) -> None:
     """Raise TooManyPathsError beyond `MOST_PATHS` paths or `MOST_NUMBERS` weights."""
     if paths > MOST_PATHS or numbers > MOST_NUMBERS:
+        number = f"{paths:.3g} paths or more" if paths < np.inf else "too many paths, which unlike agents do not order"
         raise TooManyPathsError(
-            f"the contact chain has {paths:.3g} paths or more, at most {MOST_PATHS} are gone through one by one: use "
+            f"the contact chain has {number}, at most {MOST_PATHS} are gone through one by one: use "
             "fewer steps or agents, or --method monte-carlo with --estimator optimal"
         )
