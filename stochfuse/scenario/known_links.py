@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from stochfuse.errors import UsageError
-from stochfuse.scenario.links import Links, links_of_table, read_links
+from stochfuse.scenario.links import Links, jeffreys, links_of_table, read_links
 from stochfuse.scenario.network import Network, reachable
 from stochfuse.scenario.scenario import Scenario, is_preset, load_scenario
 
@@ -78,14 +78,19 @@ def links_of_scenario(scenario: Scenario) -> Links:
     if network.agents**2 * sum(len(link) if link.ndim in (1, 3) else 1 for link in given) > MOST_NUMBERS:
         raise UsageError(f"{scenario.name}: expected at most {MOST_NUMBERS:,} links, got {network.agents:,} agents")
     link = _laid_out(given[0], network)
-    unknown = np.full_like(link, np.nan)
+    low = high = np.full_like(link, np.nan)
+    sent, received = (None, None) if network.counts is None else (M.astype(int) for M in network.counts)
+    if sent is not None and received is not None:
+        low, high = jeffreys(sent, received)
     return Links(
         source=scenario.name,
         kind=_kind(network),
         nodes=network.names or tuple(map(str, range(1, network.agents + 1))),
         link=link,
-        low=unknown,
-        high=unknown,
+        low=low,
+        high=high,
+        sent=sent,
+        received=received,
         burst=_bursts(network),
         delay=None if network.delay == (1.0,) else network.delay,
         notes=_notes(network),

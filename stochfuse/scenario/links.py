@@ -438,14 +438,19 @@ def links_of_packets(table: Mapping[str, Any], *, source: str = "table", step: f
 def _counted(
     source: str, kind: str, nodes: Sequence[str], sent: np.ndarray, received: np.ndarray, **more: Any
 ) -> Links:
+    low, high = jeffreys(sent, received)
+    link = np.divide(received, sent, out=np.full(sent.shape, np.nan), where=sent > 0)
+    return Links(source, kind, tuple(map(str, nodes)), link, low, high, sent, received, **more)
+
+
+def jeffreys(sent: np.ndarray, received: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of the 95 % interval of each link's probability from its numbers of packets; NaN where none was sent."""
     from scipy.special import betaincinv
 
     tail = (1 - CONFIDENCE) / 2
-    known = sent > 0
     a, b = received + 0.5, sent - received + 0.5
-    low, high = (np.where(known, betaincinv(a, b, q), np.nan) for q in (tail, 1 - tail))
-    link = np.divide(received, sent, out=np.full(sent.shape, np.nan), where=known)
-    return Links(source, kind, tuple(map(str, nodes)), link, low, high, sent, received, **more)
+    low, high = (np.where(sent > 0, betaincinv(a, b, q), np.nan) for q in (tail, 1 - tail))
+    return low, high
 
 
 def _mercator(name: str, table: Mapping[str, Any]) -> Links:

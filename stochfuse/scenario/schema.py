@@ -241,8 +241,9 @@ class NetworkTable(StrictTable):
         description="link probability: a number, a matrix (row: receiver, column: sender), or one of either per step; "
         "or { file = ... }, a packet log; left out, it is tabulated from 0 to 1",
     )
-    sent: list[list[Number]] | None = Field(
-        None, description="packets sent on each link (row: receiver, column: sender), behind link or instead of it"
+    sent: Number | list[list[Number]] | None = Field(
+        None,
+        description="packets sent on each link, a number or a matrix (row: receiver, column: sender), instead of link",
     )
     received: list[list[Number]] | None = Field(None, description="packets of these that were received")
     radio: RadioTable | None = Field(

@@ -170,6 +170,7 @@ def test_scenario_commands(tmp_path):
         "fcs-demo",
         "gps-ins",
         "orbit-8",
+        "orbit-8-noisy",
         "parallel-filters",
         "road-5",
         "thesis-steady",
