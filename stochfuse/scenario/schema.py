@@ -456,8 +456,9 @@ def unit(field: FieldInfo) -> str:
     extra = field.json_schema_extra
     if isinstance(extra, dict) and isinstance(extra.get("unit"), str):
         return str(extra["unit"])
-    pieces = re.split(r"[,;()\[\]]| in | above ", field.description or "")
-    return next((piece.strip() for piece in pieces if _UNIT.fullmatch(piece.strip())), "")
+    pieces = re.split(r"[,;()\[\]]| in | above | or ", field.description or "")
+    found = {piece.strip() for piece in pieces if _UNIT.fullmatch(piece.strip())}
+    return found.pop() if len(found) == 1 else ""
 
 
 def _tables(annotation: Any) -> list[type[BaseModel]]:

@@ -14,6 +14,7 @@ import pytest
 import sympy
 
 import stochfuse as sf
+from stochfuse.prediction.general import _kept
 from tests.cli.command import ENV, run, strict_json
 
 
@@ -423,6 +424,7 @@ def test_import_of_the_package_is_light():
 
 
 def test_general_method_says_what_it_shows():
+    _kept.cache_clear()  # what is known already is not announced
     done = run("predict", "--method", "general", "--steps", "3", "--link", "0.5")
     assert "general formulation (49) of the Local Fusion Graph; exact, 262,144 outcomes" in done.stdout
     assert "0.5   58.333   29.835   25.521" in done.stdout

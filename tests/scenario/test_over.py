@@ -67,6 +67,7 @@ def test_a_path_that_leads_nowhere(path, why):
         ("network.agents", ""),
         ("network.link", ""),
         ("model.R", ""),
+        ("agent[2].sensor.sigma", ""),
     ],
 )
 def test_units_come_from_the_schema(name, unit):
