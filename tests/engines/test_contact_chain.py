@@ -289,7 +289,7 @@ def test_what_the_chain_does_not_take():
         sf.predict(sf.Scenario.from_mapping(source), method="optimal")
     agents = {"agent": [{"R": [[25 + i, 0], [0, 25]]} for i in range(8)]}
     source = sf.load_scenario("cv-2d", agents=8).to_mapping() | agents
-    with pytest.raises(sf.UsageError, match="paths or more, at most 20000 are gone through one by one"):
+    with pytest.raises(sf.UsageError, match="too many paths, which unlike agents do not order, at most 20000 are gone"):
         sf.predict(sf.Scenario.from_mapping(source), [0.5], method="optimal")
     with pytest.raises(sf.UsageError, match="the optimum is only enclosed in bounds: expected quantity optimal"):
         sf.predict(sf.load_scenario(agents=50, steps=10), [0.5], method="optimal", quantity="bias")
