@@ -83,10 +83,10 @@ def events(network: Network, rows: LinkRows, step: int) -> list[Event]:
     if network.architecture == "broadcast":
         place = {(i, j): p for i in range(n) for p, j in enumerate(senders[i])}
         listeners = {j: tuple(i for i in range(n) if i != j) for j in range(n)}
-        found = [Event(j, heard, µ[:, heard[0], place[heard[0], j]]) for j, heard in listeners.items() if heard]
+        drawn = [(j, heard, µ[:, heard[0], place[heard[0], j]]) for j, heard in listeners.items() if heard]
     else:
-        found = [Event(int(j), (i,), µ[:, i, p]) for i in range(n) for p, j in enumerate(senders[i])]
-    found = [event._replace(delay=network.delay_of(event.receivers[0], event.sender)) for event in found]
+        drawn = [(int(j), (i,), µ[:, i, p]) for i in range(n) for p, j in enumerate(senders[i])]
+    found = [Event(j, heard, p, delay=network.delay_of(heard[0], j)) for j, heard, p in drawn]
     if rows.bursts is not None:
         return [e._replace(burst=rows.chain(e.probability), number=number) for number, e in enumerate(found)]
     # with one µ for all links the answer is a polynomial in µ, whatever values of µ are asked for

@@ -40,7 +40,17 @@ _FEW = 8
 
 
 class Arrivals(Protocol):
-    """Distribution of the number of arriving messages, one per item of the last axis."""
+    """Distribution of the number of arriving messages, one per item of the last axis.
+
+    Attributes
+    ----------
+    nothing : (items,) probability of no measurement at all, not even the agent's own; or 0.
+    """
+
+    @property
+    def nothing(self) -> np.ndarray | float:
+        """Probability of no measurement at all."""
+        ...
 
     def remaining(self, s: np.ndarray) -> np.ndarray:
         """E(s) for s ≥ 0 of shape (..., items)."""
@@ -136,6 +146,7 @@ class Binomial:
 
     senders: int
     link: np.ndarray
+    nothing: float = 0.0
 
     def remaining(self, s: np.ndarray) -> np.ndarray:
         """E(s)."""

@@ -127,7 +127,7 @@ def recursions(case: Case | UnlikeCase) -> list[Recursion]:
     unit = np.where(unit > 0, unit, 1.0)
     if isinstance(case, Case):  # what else may come shows no more than the first measurement does
         sensors, counts = (case.sensor,), np.array([[1], [0]])
-        nothing = np.broadcast_to(getattr(case.arrivals[1], "nothing", 0.0), case.items)
+        nothing = np.broadcast_to(case.arrivals[1].nothing, case.items)
         weights = np.stack([1.0 - nothing, nothing])
     else:
         sensors, counts, weights = case.sensors, case.counts, case.weights[1]

@@ -57,10 +57,8 @@ def posterior(network: Network, level: float, method: str, draws: int = DRAWS) -
     Raises
     ------
     UsageError
-        If links are not counted, or the level is none.
+        If links are not counted, or the method or network is not one for it.
     """
-    if not 0 < level < 1:
-        raise UsageError(f"interval: expected a probability between 0 and 1, such as 95% or 0.95, got {level:g}")
     if network.counts is None or network.link is None:
         raise UsageError(
             "interval: expected links with numbers of packets (network.link = { file = … } of a packet log, or "

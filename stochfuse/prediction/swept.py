@@ -17,9 +17,10 @@ import stochfuse
 from stochfuse.engines.progress import within
 from stochfuse.errors import UsageError
 from stochfuse.kalman.metrics import Metric
-from stochfuse.prediction.result import Prediction, Result
+from stochfuse.prediction.result import Prediction
 from stochfuse.scenario.over import Over
 from stochfuse.scenario.registry import NATURES
+from stochfuse.scenario.result import Result
 from stochfuse.scenario.scenario import Scenario
 
 T = TypeVar("T")

@@ -28,9 +28,10 @@ import numpy as np
 
 from stochfuse.errors import NoAnswerError, ScenarioError, UsageError
 from stochfuse.kalman.checks import shown
-from stochfuse.prediction.result import Prediction, Result
+from stochfuse.prediction.result import Prediction
 from stochfuse.questions.question import SLACK, Question, check_target, described, question
 from stochfuse.scenario.over import over, unit_of, with_numbers
+from stochfuse.scenario.result import Result
 from stochfuse.scenario.scenario import Scenario, of_scenario
 
 GRID = 65

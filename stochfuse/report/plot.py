@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse.errors import StochfuseError
+from stochfuse.errors import needed
 from stochfuse.report.table import write_file
 
 MOST_CURVES = 8
@@ -34,11 +34,7 @@ def figure_class() -> Any:
     StochfuseError
         If matplotlib is not installed.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise StochfuseError("plots need matplotlib: pip install 'stochfuse[plot]'") from None
-    return Figure
+    return needed("matplotlib.figure", "plot", "plots need").Figure
 
 
 def save(draw: Callable[[], Any], output: Path) -> None:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import io
-from importlib import import_module
 from typing import Any
 
-from stochfuse.errors import StochfuseError, UsageError
+from stochfuse.errors import UsageError, needed
 from stochfuse.estimators.fusion_graph import FusionGraph
 from stochfuse.kalman.metrics import metric
 from stochfuse.prediction.compare import Comparison, EstimatorComparison
@@ -113,7 +112,7 @@ def _view(p: Prediction | Swept, of: str | None = None, agent: int | str = "mean
 
 def frame_of(result: Any, **shown: Any) -> Any:
     """Return a result's records as a tidy pandas DataFrame, a number a row, with everything that says what it is."""
-    pandas = installed("pandas")
+    pandas = needed("pandas", "data")
     if isinstance(result, Results):
         return pandas.read_parquet(result.path) if result.path.suffix == ".parquet" else pandas.read_csv(result.path)
     if isinstance(result, Links):  # nodes' names stay names, whatever they look like ("1", "NA")
@@ -135,7 +134,7 @@ def arrays_of(result: Any) -> Any:
     Axes are link (or case), step, agent, row and column; of a bias there is no column.  Of links it is a Dataset, its
     axes receiver and sender.
     """
-    xarray = installed("xarray")
+    xarray = needed("xarray", "data")
     if isinstance(result, Prediction | Swept):
         return _array(xarray, result)
     if isinstance(result, Links):
@@ -144,7 +143,7 @@ def arrays_of(result: Any) -> Any:
         axis = "method" if isinstance(result, Comparison) else "estimator"
         names = result.methods if isinstance(result, Comparison) else result.estimators
         arrays = [_array(xarray, p) for p in result.predictions]
-        return xarray.concat(arrays, installed("pandas").Index(names, name=axis), combine_attrs="drop_conflicts")
+        return xarray.concat(arrays, needed("pandas", "data").Index(names, name=axis), combine_attrs="drop_conflicts")
     return frame_of(result).to_xarray()
 
 
@@ -160,7 +159,7 @@ def _array(xarray: Any, p: Prediction | Swept) -> Any:
 
 def _of_points(xarray: Any, p: Swept) -> Any:
     """Arrays of all points along an axis per key; those of points with one link along no other."""
-    index, first = installed("pandas").Index, "link" if p.cases is None else "case"
+    index, first = needed("pandas", "data").Index, "link" if p.cases is None else "case"
     each = len(p.link) // len(p.over.points)
     points = [_rows_of_point(xarray, p, k, each, first) for k in range(len(p.over.points))]
     for key in reversed(p.over.keys):
@@ -207,17 +206,3 @@ def _of_one(xarray: Any, p: Prediction) -> Any:
         "states": ", ".join(states),
     }
     return xarray.DataArray(values, coords, [name for name, _ in axes], name=f"{p.quantity}_covariance", attrs=attrs)
-
-
-def installed(name: str) -> Any:
-    """Return a module of the extra `data`.
-
-    Raises
-    ------
-    StochfuseError
-        If it is not installed; with the line that installs it.
-    """
-    try:
-        return import_module(name)
-    except ImportError:
-        raise StochfuseError(f"this needs {name}: pip install 'stochfuse[data]'") from None

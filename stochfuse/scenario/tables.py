@@ -31,10 +31,11 @@ def read_network(check: Checker, table: Mapping[str, Any], agent_tables: Sequenc
         if isinstance(table.get("link"), int | float):
             check.link("network.link", table["link"], 1, 1)
         return None
+    hears = _hears(check, table.get("hears"), agents, architecture)
     counts = _counts(check, table, agents)
     given = table.get("link")
     if counts is not None and given is None:
-        given = _ratios(check, *counts, table.get("hears"))
+        given = _ratios(check, *counts, hears)
     link = read_link(check, "network.link", given, agents, steps, architecture)
     radio = read_radio(check, table.get("radio"))
     places = read_places(check, agent_tables, agents, steps, needed=table.get("radio") is not None)
@@ -67,7 +68,6 @@ def read_network(check: Checker, table: Mapping[str, Any], agent_tables: Sequenc
             cases.append((name, own))
             bursts.append(bursty)
     delay, delays = _delays(check, table.get("delay"), agents, architecture)
-    hears = _hears(check, table.get("hears"), agents, architecture)
     if hears is not None and any(b is not None for b in (burst, *bursts)):
         check.note("network.hears", "links without memory (no burst)", "a burst")
     names = _agent_names(check, table.get("nodes"), agent_tables, agents)
@@ -114,11 +114,11 @@ def _counts(check: Checker, table: Mapping[str, Any], agents: int) -> tuple[np.n
     return sent, received
 
 
-def _ratios(check: Checker, sent: np.ndarray, received: np.ndarray, hears: Any) -> list[list[float]]:
-    for i, j in np.argwhere((sent == 0) & ~np.eye(len(sent), dtype=bool)).tolist():
-        if not (isinstance(hears, list) and i < len(hears) and j + 1 not in (hears[i] or [])):
-            check.note(f"network.sent[{i + 1}][{j + 1}]", "packets, or network.hears without this link", "0")
-            break
+def _ratios(check: Checker, sent: np.ndarray, received: np.ndarray, hears: np.ndarray | None) -> list[list[float]]:
+    unknown = np.argwhere((sent == 0) & (~np.eye(len(sent), dtype=bool) if hears is None else hears))
+    if len(unknown):
+        i, j = unknown[0].tolist()
+        check.note(f"network.sent[{i + 1}][{j + 1}]", "packets, or network.hears without this link", "0")
     return np.divide(received, sent, out=np.zeros_like(sent), where=sent > 0).tolist()
 
 

@@ -118,12 +118,10 @@ def test_a_file_keeps_everything(tmp_path):
 
 
 def test_a_missing_library_is_named_with_the_line_that_installs_it(monkeypatch):
-    from stochfuse.report import results
-
     def missing(name):
         raise ImportError(name)
 
-    monkeypatch.setattr(results, "import_module", missing)
+    monkeypatch.setattr("stochfuse.errors.import_module", missing)
     with pytest.raises(sf.StochfuseError, match=r"this needs xarray: pip install 'stochfuse\[data\]'"):
         sf.predict(MINE, [0.5]).to_xarray()
 
