@@ -1,0 +1,8 @@
+"""Data: records of what was measured, what arrived and what was true; run, simulate, and check a simulator.
+
+One record of measurements and arrivals is one outcome.  `run` puts it through the estimators that the other rooms
+average over chance (`stochfuse.engines.replay`), `simulate` draws such records, and `crosscheck` lays a simulator's
+results beside the prediction and says what would explain a difference.
+
+The room knows files and the rooms below; it knows no table and no screen.
+"""
