@@ -45,9 +45,9 @@ class Blender(RecursiveEstimator):
         rows = np.concatenate([np.arange(j * D, (j + 1) * D) for j in members])
         found = self.blended(self._filters.shaped(step)[np.ix_(rows, rows)], len(members))
         x = None
-        if self.footprints is not None:
+        if self.riding is not None:
             terms = zip(found.weights, members, rests_on, strict=True)
-            x = np.sum([B @ self._shape(j) @ each.x for B, j, each in terms], axis=0)
+            x = np.sum([B @ (self._shape(j) @ each.x + self.riding.shift(j)) for B, j, each in terms], axis=0)
         return Worked(np.broadcast_to(found.P, (len(rules), *found.P.shape)), x)
 
     def blended(self, joint: np.ndarray, filters: int) -> Blend:

@@ -45,7 +45,7 @@ class Lwin(RecursiveEstimator):
         # agreement is the same between any two
         pairs = [(agents[0], j) for j in agents[1:]] if agents else [(0, 1)] * len(neighbours)
         for pair, neighbour in zip(pairs, neighbours, strict=True):
-            z = None if self.footprints is None else self.footprints.related(step, pair)
+            z = None if self.riding is None else self.riding.related(step, pair)
             own = lwin_update(own, neighbour, *self.world.between(step, pair), z)
         return Worked(own.P, own.x)
 
@@ -79,14 +79,18 @@ class Itns(RecursiveEstimator):
         if name == BLOCK:
             rows = self.world.states[rules[0][1]]
             (joint,) = rests_on
+            if self.readings is not None:
+                return Worked(joint.P[:, rows, rows], joint.x[:, rows])
             if joint.actual is None:
                 return Worked(joint.P[:, rows, rows])
             return Worked(joint.P[:, rows, rows], actual=joint.actual[:, rows, rows], bias=joint.bias[:, rows])
         joint = self._exchanged(step, rules, rests_on[0])
-        return joint.settled() if self.errors else joint
+        return joint.settled() if self.errors and self.readings is None else joint
 
     def _first(self) -> Worked:
         world = self.world
+        if self.readings is not None:
+            return Worked(world.P0[None], self.readings.start(slice(None))[None])
         if not self.errors:
             return Worked(world.P0[None])
         b = np.zeros((len(world.P0), 1)) if world.error is None else world.error
@@ -94,9 +98,11 @@ class Itns(RecursiveEstimator):
 
     def _local(self, step: int, before: Worked, missed: Sequence[int]) -> Worked:
         """Time update of the whole and all local measurements, but those of agents whose sensor misses."""
-        world = self.world
+        world, data = self.world, self.readings
         x, w, v = None, None, None
-        if self.errors:
+        if data is not None:
+            x, w = before.x, data.process(step, slice(None))
+        elif self.errors:
             x, (w, v) = self._with_columns(
                 step,
                 factor(before.actual),
@@ -108,8 +114,12 @@ class Itns(RecursiveEstimator):
         estimate = prior
         for agent, rows in enumerate(world.measurements):
             if rows.stop > rows.start and agent not in missed:
-                z = None if v is None else v[rows]
-                estimate = itns_update(estimate, world.joint_sensor(agent, step), at_step(world.R[agent], step), z)
+                H, R, z = world.joint_sensor(agent, step), at_step(world.R[agent], step), None
+                if data is not None:
+                    H, z = data.sensor(step, agent, H), data.measured(step, agent)
+                elif v is not None:
+                    z = v[rows]
+                estimate = itns_update(estimate, H, R, z)
         self.grown(prior.P, estimate.P)
         return Worked(estimate.P, estimate.x)
 
@@ -145,7 +155,10 @@ class Itns(RecursiveEstimator):
             if not here.any():
                 continue
             z = None
-            if x is not None:
+            if self.readings is not None:
+                z = self.readings.related(step, pair)
+                z = z[here] if z.ndim > 2 else z
+            elif x is not None:
                 z = np.zeros((len(H), x.shape[-1]))
                 if self.world.own:
                     z[:, columns] = factor(R)

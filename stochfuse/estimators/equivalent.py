@@ -11,20 +11,20 @@ on by itself,  (I − K̄H) A⁻ (I − K̄H)ᵀ + K̄ A (R + Δ) Aᵀ K̄ᵀ.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from stochfuse.errors import UsageError
-from stochfuse.estimators.recursion import FusionStep, RecursiveEstimator, Worked
+from stochfuse.estimators.recursion import FusionStep, PastState, RecursiveEstimator, Worked
 from stochfuse.fusion.equivalent import (
     Equivalent,
     actual_error,
     equivalent_measurement,
     independent_measurement,
 )
-from stochfuse.kalman.kernel import Estimate, at_step, corrected, gain, predict
+from stochfuse.kalman.kernel import Estimate, at_step, corrected, gain, predict, update
 
 MEASURED, MISSED = "measured", "missed"
 
@@ -61,6 +61,21 @@ class EquivalentMeasurement(RecursiveEstimator):
         before = self.pasts.rests_on[values[agent]][0] if missed[agent] else values[agent]
         return self.pasts.number(step, rule, (before,))
 
+    def rests_on(self, state: PastState) -> Iterator[int]:
+        """Of an agent whose sensor missed, what it had before: the state says only that it missed."""
+        for value in state.agents:
+            missed = self.pasts.rule[value][0] == MISSED
+            yield self.pasts.rests_on[value][0] if missed else value
+
+    def renamed(self, state: PastState, names: Mapping[int, int], into: Any) -> PastState:
+        """Say again who missed."""
+        agents = []
+        for value in state.agents:
+            rule, before = self.pasts.rule[value], self.pasts.rests_on[value]
+            missed = rule[0] == MISSED
+            agents.append(into.pasts.number(state.step, rule, (names[before[0]],)) if missed else names[value])
+        return PastState(state.step, tuple(agents))
+
     def onward(self, step: int, agent: int, fused: int, before: int, missed: bool) -> int:
         """The estimate itself: what is measured next, if it is, is taken in with what is heard then."""
         return self.pasts.number(step + 1, (MISSED, agent), (fused,)) if missed else fused
@@ -68,6 +83,8 @@ class EquivalentMeasurement(RecursiveEstimator):
     def first(self, rows: slice) -> Worked:
         """First estimate, with its actual moments."""
         P = self.world.P0[rows, rows][None]
+        if self.readings is not None:
+            return Worked(P, self.readings.start(rows)[None])
         if not self.errors:
             return Worked(P)
         b = np.zeros((P.shape[-1], 1)) if self.world.error is None else self.world.error[rows]
@@ -80,6 +97,10 @@ class EquivalentMeasurement(RecursiveEstimator):
         if name == MISSED:  # only says so of the estimate that it rests on
             return before
         F, Q = at_step(self.world.F[agent], step), at_step(self.world.Q, step)[rows, rows]
+        if self.readings is not None:
+            return self._on_data(
+                step, predict(Estimate(before.x, before.P), F, Q, self.readings.process(step, rows)), members
+            )
         prior = predict(Estimate(before.bias, before.P), F, Q)
         truth = None if before.actual is None else predict(Estimate(None, before.actual), F, Q).P
         if not members:
@@ -91,6 +112,15 @@ class EquivalentMeasurement(RecursiveEstimator):
         if truth is None:
             return Worked(P)
         return Worked(P, actual=corrected(truth, K, H, noise), bias=prior.x - K @ (H @ prior.x))
+
+    def _on_data(self, step: int, prior: Estimate, members: Sequence[int]) -> Worked:
+        """One measurement of what was measured, z̄ = A z."""
+        if not members or self.readings is None:
+            return Worked(prior.P, prior.x)
+        fused, _ = self._measurement(step, tuple(members))
+        z = np.concatenate([self.readings.measured(step, j) for j in members], axis=-2)
+        x, P = update(prior, at_step(self.world.H[members[0]], step), fused.R, fused.weights @ z)
+        return Worked(P, x)
 
     def _measurement(self, step: int, members: tuple[int, ...]) -> tuple[Equivalent, np.ndarray]:
         """Equivalent measurement of some sensors, and what its error covariance truly is."""

@@ -97,10 +97,10 @@ class SplitCovarianceIntersection(RecursiveEstimator):
             maps.append(H_i)
             known[place] = H_j @ known[place] @ H_j.T + (0.0 if self.split else R)
             independent[place] = H_j @ independent[place] @ H_j.T + (R if self.split else 0.0 * R)
-            if self.footprints is not None:
-                signals.append(self.footprints.related(step, (agent, j)) - H_j @ rests_on[place].x)
+            if self.riding is not None:
+                signals.append(self.riding.related(step, (agent, j)) - H_j @ rests_on[place].x)
         stack = self._stack(step, known, independent, maps)
-        return Worked(stack.C, None if self.footprints is None else _sum(stack.gains, signals))
+        return Worked(stack.C, None if self.riding is None else _sum(stack.gains, signals))
 
 
 class CovarianceIntersection(SplitCovarianceIntersection):

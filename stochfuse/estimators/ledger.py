@@ -36,7 +36,7 @@ from stochfuse.kalman.kernel import (
 )
 from stochfuse.scenario.model import Model, Sensor
 
-START, MEASURED, PRIOR = "start", "measured", "prior"
+START, MEASURED, PRIOR, GIVEN = "start", "measured", "prior", "given"
 COMMON = -1
 """Source of an initial estimate that all agents share."""
 
@@ -104,6 +104,10 @@ class Ledger(Renamed):
     def start(self, source: int) -> int:
         """Information of an initial estimate, at step 1."""
         return self._value(1, ((self._atom(START, 1, source), 1),))
+
+    def given(self, step: int) -> int:
+        """A value of its own, whose numbers are known to whoever asks for it."""
+        return self._value(step, ((self._atom(GIVEN, step, len(self.sums)), 1),))
 
     def local(self, value: int, source: int | None) -> int:
         """The next step's local estimate: predicted from a fused value, with the source's own measurement if any."""

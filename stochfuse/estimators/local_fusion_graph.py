@@ -24,7 +24,7 @@ of the true state whatever it is, so that states found equal are; the property t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from stochfuse.estimators.ledger import COMMON, Ledger
@@ -122,6 +122,17 @@ class LocalFusionGraph(FusionRule):
         """Open the exchange of the state's step."""
         values, below = [value for value, _ in state.nodes], [below for _, below in state.nodes]
         return GraphExchange(self, Pedigrees(self.ledger, values, below), state.agents, state.late)
+
+    def rests_on(self, state: GraphState) -> Iterator[int]:
+        """Values that a state rests on."""
+        yield from (value for value, _ in state.nodes)
+        yield from (agent.value for agent in state.agents)
+
+    def renamed(self, state: GraphState, names: Mapping[int, int], into: LocalFusionGraph) -> GraphState:
+        """Return the state with the numbers that another one of these has for its values."""
+        nodes = tuple((names[value], below) for value, below in state.nodes)
+        agents = tuple(agent._replace(value=names[agent.value]) for agent in state.agents)
+        return state._replace(nodes=nodes, agents=agents)
 
 
 class GraphExchange:

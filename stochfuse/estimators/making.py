@@ -69,6 +69,18 @@ def make(
     return Made(name, estimator, partial(_of_sums, ledger, errors, records))
 
 
+def make_for_data(system: System, name: str, criterion: str = "det") -> Any:
+    """Make an estimator whose values are of agents, not of kinds of them: their data tell them apart.
+
+    What its values come to: `stochfuse.estimators.readings`.
+    """
+    entry, rule, everyone = registry.estimator(name), rule_of(name), tuple(range(system.agents))
+    if entry.sums:
+        return rule(Ledger(), everyone, shared=system.shared)
+    more = {"criterion": criterion} if entry.weighs else {}
+    return rule(world_of(system), everyone, errors=True, **more)
+
+
 def rule_of(name: str) -> Any:
     """Return an estimator's class, its file imported when it is asked for."""
     file, kind = registry.estimator(name).place

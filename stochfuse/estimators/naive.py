@@ -8,7 +8,7 @@ covariance falls below what any estimator can reach.  A late message is brought 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from stochfuse.estimators.ledger import COMMON
@@ -34,6 +34,16 @@ class NaiveFusion(FusionRule):
     def exchange(self, state: NaiveState) -> NaiveExchange:
         """Open the exchange of the state's step."""
         return NaiveExchange(self, state)
+
+    def rests_on(self, state: NaiveState) -> Iterator[int]:
+        """Values that a state rests on."""
+        yield from state.agents
+        yield from (value for _, _, value in state.late)
+
+    def renamed(self, state: NaiveState, names: Mapping[int, int], into: NaiveFusion) -> NaiveState:
+        """Return the state with the numbers that another one of these has for its values."""
+        late = tuple(sorted((receiver, left, names[value]) for receiver, left, value in state.late))
+        return NaiveState(tuple(names[value] for value in state.agents), late)
 
 
 class NaiveExchange:

@@ -10,7 +10,7 @@ and is what it truly achieves.  A received node brings the measurements of its w
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from stochfuse.estimators.ledger import COMMON, Ledger
@@ -21,10 +21,14 @@ Held = tuple[int, ...]
 
 
 class KnownSets(NamedTuple):
-    """Before an exchange: what every agent holds, and (receiver, steps left, held) of messages under way."""
+    """Before an exchange: what every agent holds, and (receiver, steps left, held) of messages under way.
+
+    Where all hold the same of the first steps, these may be left out: `base` is then what they come to.
+    """
 
     agents: tuple[Held, ...]
     late: tuple[tuple[int, int, Held], ...] = ()
+    base: int | None = None
 
 
 class OptimalFusion(FusionRule):
@@ -34,7 +38,7 @@ class OptimalFusion(FusionRule):
 
     def __init__(self, ledger: Ledger, sources: Sequence[int], **more: Any) -> None:
         super().__init__(ledger, sources, **more)
-        self._values: dict[Held, int] = {}
+        self._values: dict[tuple[int | None, Held], int] = {}
 
     def start(self) -> KnownSets:
         """Everyone's initial estimate."""
@@ -44,20 +48,46 @@ class OptimalFusion(FusionRule):
         """Open the exchange of the state's step."""
         return OptimalExchange(self, state)
 
-    def value(self, held: Held) -> int:
-        """Value, in the ledger, of one filter over everything held."""
-        known = self._values.get(held)
-        if known is None:
-            *before, last = held
-            members = [self.sources[i] for i in range(len(self.sources)) if last >> i & 1]
-            if before:
-                known = self.ledger.measured(self.value(tuple(before)), members)
+    def value(self, held: Held, base: int | None = None) -> int:
+        """Value, in the ledger, of one filter over everything held, after what the base is of."""
+        values, first = self._values, len(held)
+        while first and (base, held[:first]) not in values:
+            first -= 1
+        value = values[base, held[:first]] if first else base
+        for t in range(first, len(held)):
+            members = [self.sources[i] for i in range(len(self.sources)) if held[t] >> i & 1]
+            if value is not None:
+                value = self.ledger.measured(value, members)
             elif self.shared:
-                known = self.ledger.start(COMMON)
+                value = self.ledger.start(COMMON)
             else:
-                known = self.ledger.combine(1, [(self.ledger.start(source), 1) for source in members])
-            self._values[held] = known
-        return known
+                value = self.ledger.combine(1, [(self.ledger.start(source), 1) for source in members])
+            values[base, held[: t + 1]] = value
+        if value is None:
+            raise ValueError("expected something held")
+        return value
+
+    def rests_on(self, state: KnownSets) -> Iterator[int]:
+        """Values that a state rests on: what all hold, and each agent's own."""
+        base, known, _ = self._shared_part(state)
+        yield from (value for value in {state.base, base} if value is not None)
+        yield from known
+
+    def renamed(self, state: KnownSets, names: Mapping[int, int], into: OptimalFusion) -> KnownSets:
+        """Return the state, without what all hold, with the numbers that another one of these has for its values."""
+        base, _, shared = self._shared_part(state)
+        agents = tuple(held[shared:] for held in state.agents)
+        late = tuple((r, left, held[shared:]) for r, left, held in state.late)
+        return KnownSets(agents, late, None if base is None else names[base])
+
+    def _shared_part(self, state: KnownSets) -> tuple[int | None, list[int], int]:
+        """Value of the first steps, of which all hold the same; every agent's value; and how many these steps are."""
+        everything = [*state.agents, *(held for _, _, held in state.late)]
+        longest = min(map(len, everything)) - 1
+        shared = next((t for t in range(longest) if len({held[t] for held in everything}) > 1), max(longest, 0))
+        known = [self.value(held, state.base) for held in state.agents]
+        base = self.value(state.agents[0][:shared], state.base) if shared else state.base
+        return base, known, shared
 
 
 class OptimalExchange:
@@ -81,7 +111,7 @@ class OptimalExchange:
 
     def fused(self, agent: int, heard: Sequence[int]) -> int:
         """Value that an agent would claim after hearing some agents, with what else is due."""
-        return self.estimator.value(self.held(agent, heard[agent]))
+        return self.estimator.value(self.held(agent, heard[agent]), self.state.base)
 
     def after(
         self, heard: Sequence[int], late: Sequence[Late] = (), missed: int = 0
@@ -99,7 +129,7 @@ class OptimalExchange:
         under_way = [(r, left - 1, held) for r, left, held in self.state.late if left > 0]
         under_way += [(m.receiver, m.delay - 1, self.state.agents[m.sender]) for m in late]
         agents = tuple((*self.held(i, h), 1 << i & ~missed) for i, h in enumerate(heard))
-        return KnownSets(agents, tuple(sorted(under_way)))
+        return KnownSets(agents, tuple(sorted(under_way)), self.state.base)
 
 
 def _moved(state: KnownSets, order: tuple[int, ...]) -> KnownSets:
@@ -109,4 +139,4 @@ def _moved(state: KnownSets, order: tuple[int, ...]) -> KnownSets:
         return tuple(sum(1 << p for i, p in place.items() if mask >> i & 1) for mask in held)
 
     late = tuple(sorted((place[r], left, moved(held)) for r, left, held in state.late))
-    return KnownSets(tuple(moved(state.agents[i]) for i in order), late)
+    return KnownSets(tuple(moved(state.agents[i]) for i in order), late, state.base)

@@ -13,7 +13,7 @@ Pasts: what estimates are made of, under numbers that are equal where the pasts 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ import numpy as np
 from stochfuse.errors import UsageError
 from stochfuse.estimators.ledger import Renamed
 from stochfuse.estimators.protocol import Late, in_least_order
-from stochfuse.estimators.world import Footprints, World
+from stochfuse.estimators.world import Footprints, Riding, World
 from stochfuse.kalman.kernel import Estimate, at_step, predict, update
 from stochfuse.kalman.metrics import Moments
 
@@ -92,6 +92,7 @@ class RecursiveEstimator:
         self.labels = everyone if errors else tuple(kinds.index(kind) for kind in kinds)
         self.pasts = Pasts(self.symmetric, kinds if errors else None)
         self.errors = errors
+        self.readings: Riding | None = None
         self.magnified = 1.0
         self._neighbours: dict[tuple[int, int], tuple[int, ...]] = {}
 
@@ -100,6 +101,11 @@ class RecursiveEstimator:
         """Noise footprints, where errors are carried along; large, and so not made before they are asked for."""
         return Footprints(self.world) if self.errors else None
 
+    @property
+    def riding(self) -> Riding | None:
+        """What rides along with covariances: what was measured (`readings`), noise footprints, or nothing."""
+        return self.footprints if self.readings is None else self.readings
+
     def start(self) -> PastState:
         """Everyone's first estimate."""
         return PastState(1, tuple(self.pasts.number(1, ("start", label)) for label in self.labels))
@@ -107,6 +113,16 @@ class RecursiveEstimator:
     def exchange(self, state: PastState) -> PastExchange:
         """Open the exchange of the state's step."""
         return PastExchange(self, state)
+
+    def rests_on(self, state: PastState) -> Iterator[int]:
+        """Values that a state rests on."""
+        yield from state.agents
+        yield from (value for _, _, value in state.late)
+
+    def renamed(self, state: PastState, names: Mapping[int, int], into: Any) -> PastState:
+        """Return the state with the numbers that another estimator of this kind has for its values."""
+        late = tuple(sorted((receiver, left, names[value]) for receiver, left, value in state.late))
+        return PastState(state.step, tuple(names[value] for value in state.agents), late)
 
     def fuse(self, step: int, agent: int, values: Sequence[int], heard: int, due: Sequence[int]) -> int:
         """Value that an agent claims.
@@ -156,23 +172,29 @@ class RecursiveEstimator:
     def first(self, rows: slice) -> Worked:
         """First estimate of some rows of the stacked state, as a batch of one."""
         P = self.world.P0[rows, rows][None]
-        return Worked(P, None if self.footprints is None else self.footprints.start(rows)[None], np.zeros_like(P))
+        return Worked(P, None if self.riding is None else self.riding.start(rows)[None], np.zeros_like(P))
 
     def prior(self, step: int, agent: int, before: Worked) -> Estimate:
         """Time update of an agent's estimates."""
         rows = self.world.states[agent]
-        moved = None if self.footprints is None else self.footprints.process(step, rows)
+        moved = None if self.riding is None else self.riding.process(step, rows)
         Q = at_step(self.world.Q, step)[rows, rows]
         return predict(Estimate(before.x, before.P), at_step(self.world.F[agent], step), Q, moved)
 
     def local(self, step: int, agent: int, before: Worked) -> Worked:
         """Time update and the agent's own measurement."""
-        H, R = at_step(self.world.H[agent], step), at_step(self.world.R[agent], step)
-        z = None if self.footprints is None else self.footprints.measured(step, agent)
+        H, R, z = self.seen(step, agent)
         prior = self.prior(step, agent, before)
         x, P = update(prior, H, R, z)
         self.grown(prior.P, P)
-        return Worked(P, x, P @ (H.T @ np.linalg.solve(R, H)) @ P)
+        return Worked(P, x, P @ (np.swapaxes(H, -1, -2) @ np.linalg.solve(R, H)) @ P)
+
+    def seen(self, step: int, agent: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """What an agent's sensor measures, H and R, and what it says to what rides along."""
+        H, R = at_step(self.world.H[agent], step), at_step(self.world.R[agent], step)
+        if self.riding is None:
+            return H, R, None
+        return self.riding.sensor(step, agent, H), R, self.riding.measured(step, agent)
 
     def grown(self, prior: np.ndarray, posterior: np.ndarray) -> None:
         """Remember by how much the rounding of a prior covariance grew beside a posterior one."""
@@ -245,7 +267,7 @@ class PastClaims:
                 self._settle([b for b, s in enumerate(steps) if s == step - 2])
             steps.append(step)
             rests_on = np.array([estimator.pasts.rests_on[n] for n in numbers], dtype=int).reshape(len(numbers), -1)
-            worked = _worked_out(estimator, step, rules, [self._gathered(column) for column in rests_on.T])
+            worked = worked_out(estimator, step, rules, [self._gathered(column) for column in rests_on.T])
             self._batch[numbers], self._row[numbers] = len(self._worked), np.arange(len(numbers))
             self._worked.append(worked)
         self._settle([b for b, s in enumerate(steps) if s >= steps[-1] - 1])
@@ -267,27 +289,30 @@ class PastClaims:
             self._worked[batch] = self._worked[batch].settled()
 
     def _gathered(self, numbers: np.ndarray) -> Worked:
-        batches = np.unique(self._batch[numbers])
-        if len(batches) == 1:
-            chosen = self._row[numbers]
-            return Worked(*(None if a is None else a[chosen] for a in self._worked[batches[0]]))
-        return Worked(*(self._filled(place, numbers, batches) for place in range(len(Worked._fields))))
-
-    def _filled(self, place: int, numbers: np.ndarray, batches: np.ndarray) -> np.ndarray | None:
-        parts = [self._worked[batch][place] for batch in batches]
-        if any(part is None for part in parts):
-            return None
-        first = parts[0]
-        out = np.empty((len(numbers), *first.shape[1:]))
-        for batch, part in zip(batches, parts, strict=True):
-            here = self._batch[numbers] == batch
-            out[here] = part[self._row[numbers[here]]]
-        return out
+        return assembled(self._worked, self._batch[numbers], self._row[numbers])
 
 
-def _worked_out(
-    estimator: RecursiveEstimator, step: int, rules: Sequence[FusionStep], rests_on: list[Worked]
-) -> Worked:
+def assembled(worked: Sequence[Worked], batch: np.ndarray, row: np.ndarray) -> Worked:
+    """Stacks of estimates of which each is a row of one of some batches."""
+    batches = np.unique(batch)
+    if len(batches) == 1:
+        return Worked(*(None if a is None else a[row] for a in worked[batches[0]]))
+    return Worked(
+        *(_filled([worked[b][place] for b in batches], batches, batch, row) for place in range(len(Worked._fields)))
+    )
+
+
+def _filled(parts: Sequence[Any], batches: np.ndarray, batch: np.ndarray, row: np.ndarray) -> np.ndarray | None:
+    if any(part is None for part in parts):
+        return None
+    out = np.empty((len(row), *parts[0].shape[1:]))
+    for number, part in zip(batches, parts, strict=True):
+        here = batch == number
+        out[here] = part[row[here]]
+    return out
+
+
+def worked_out(estimator: RecursiveEstimator, step: int, rules: Sequence[FusionStep], rests_on: list[Worked]) -> Worked:
     """Work a batch out, and see that covariances come of it."""
     mend = "expected noises R that are not negligible beside the errors P, in units in which P is not far from 1"
     try:
@@ -333,6 +358,10 @@ class Pasts(Renamed):
             self.rule.append(rule)
             self.rests_on.append(key[2])
         return known
+
+    def given(self, step: int) -> int:
+        """A past of its own, whose numbers are known to whoever asks for it."""
+        return self.number(step, ("given", len(self.step)))
 
     def _renamed(self, value: int, into: Pasts, names: Sequence[int], known: dict[int, int]) -> int:
         new = known.get(value)

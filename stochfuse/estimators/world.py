@@ -35,7 +35,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -133,6 +133,37 @@ class World:
         return same, -same, 0.0 * same
 
 
+class Riding(Protocol):
+    """What rides along with covariances, in the place of a state estimate: noise footprints, or what was measured.
+
+    All are columns (d, columns), or stacks of them, one for each estimate that is worked on.
+    """
+
+    def start(self, rows: slice) -> np.ndarray:
+        """First estimates, some rows of the stacked state."""
+        ...
+
+    def process(self, step: int, rows: slice) -> np.ndarray:
+        """What a prediction adds."""
+        ...
+
+    def sensor(self, step: int, agent: int, H: np.ndarray) -> np.ndarray:
+        """What an agent's sensor sees of its state, where the model says H."""
+        ...
+
+    def measured(self, step: int, agent: int) -> np.ndarray:
+        """What an agent measures."""
+        ...
+
+    def related(self, step: int, pair: tuple[int, int]) -> np.ndarray:
+        """What one agent measures of another."""
+        ...
+
+    def shift(self, agent: int) -> np.ndarray:
+        """S of a filter whose output M x + s is the state."""
+        ...
+
+
 class Footprints:
     """Noise footprints of a world: columns of unit noises, and a last one for the known initial error."""
 
@@ -166,6 +197,14 @@ class Footprints:
     def process(self, step: int, rows: slice) -> np.ndarray:
         """What prediction leaves out, for some rows of the stacked state."""
         return self._placed(-self._process[step][rows], self._first["process", step])
+
+    def sensor(self, step: int, agent: int, H: np.ndarray) -> np.ndarray:
+        """What the model says."""
+        return H
+
+    def shift(self, agent: int) -> np.ndarray:
+        """No error comes of it."""
+        return np.zeros((1, 1))
 
     def measured(self, step: int, agent: int) -> np.ndarray:
         """Noise of an agent's measurement."""
