@@ -247,26 +247,50 @@ def _runs_of(block: int, runs: int) -> int:
 
 
 def _draw(experiment: Experiment, row: int, block: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Fates of a block's events per step, (runs, events): 0 lost, 1 + delay otherwise; and which agents' sensors miss
-    at each step, (runs, agents).
-    """
+    """Fates and misses of a block, see `draw_fates`."""
     generator = np.random.default_rng(np.random.SeedSequence(experiment.seed, spawn_key=(row, block)))
     runs = _runs_of(block, experiment.runs)
+    return draw_fates(generator, experiment.events, experiment.detections, (runs, experiment.agents), row)
+
+
+def draw_fates(
+    generator: np.random.Generator,
+    events: Sequence[Sequence[Event]],
+    detections: Sequence[Sequence[Detection]],
+    size: tuple[int, int],
+    row: int = 0,
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Draw what becomes of messages and measurements.
+
+    Parameters
+    ----------
+    generator : of random numbers.
+    events, detections : of every step.
+    size : numbers of runs and agents.
+    row : of link probabilities.
+
+    Returns
+    -------
+    fates, missed : list of ndarray
+        Per step: fates of the events (runs, events), 0 lost, 1 + delay otherwise; and which agents' sensors miss,
+        (runs, agents).
+    """
+    runs, agents = size
     out, missing, bad = [], [], None
-    for events, detections in zip(experiment.events, experiment.detections, strict=True):
-        missed = np.zeros((runs, experiment.agents), dtype=np.int64)
-        for agent, p in detections:
+    for now, draws in zip(events, detections, strict=True):
+        missed = np.zeros((runs, agents), dtype=np.int64)
+        for agent, p in draws:
             missed[:, agent] = generator.random(runs) >= p
         missing.append(missed)
-        µ = np.array([event.probability[row] for event in events])
-        bursts = [event.burst[row] for event in events if event.burst is not None]
+        µ = np.array([event.probability[row] for event in now])
+        bursts = [event.burst[row] for event in now if event.burst is not None]
         if bursts:
             to_bad, to_good, good_µ, bad_µ = np.array(bursts).T
             change = to_bad / (to_bad + to_good) if bad is None else np.where(bad, 1.0 - to_good, to_bad)
-            bad = generator.random((runs, len(events))) < change
+            bad = generator.random((runs, len(now))) < change
             µ = np.where(bad, bad_µ, good_µ)
-        arrived = generator.random((runs, len(events))) < µ
-        out.append(np.where(arrived, 1 + _delays(events, runs, generator), 0))
+        arrived = generator.random((runs, len(now))) < µ
+        out.append(np.where(arrived, 1 + _delays(now, runs, generator), 0))
     return out, missing
 
 

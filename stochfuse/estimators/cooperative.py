@@ -90,7 +90,7 @@ class Itns(RecursiveEstimator):
     def _first(self) -> Worked:
         world = self.world
         if self.readings is not None:
-            return Worked(world.P0[None], self.readings.start(slice(None))[None])
+            return Worked(world.P0[None], self.readings.start(slice(None)))
         if not self.errors:
             return Worked(world.P0[None])
         b = np.zeros((len(world.P0), 1)) if world.error is None else world.error

@@ -84,7 +84,7 @@ class EquivalentMeasurement(RecursiveEstimator):
         """First estimate, with its actual moments."""
         P = self.world.P0[rows, rows][None]
         if self.readings is not None:
-            return Worked(P, self.readings.start(rows)[None])
+            return Worked(P, self.readings.start(rows))
         if not self.errors:
             return Worked(P)
         b = np.zeros((P.shape[-1], 1)) if self.world.error is None else self.world.error[rows]

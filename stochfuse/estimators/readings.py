@@ -60,7 +60,7 @@ class Readings:
     Parameters
     ----------
     world : what the filters are told.
-    x0, inputs : (D, 1) first estimates and (steps, D, 1) known inputs, stacked over the agents.
+    x0, inputs : (runs, D, 1) first estimates and (steps, D, 1) known inputs, stacked over the agents.
     shifts : (d, 1) of each agent, what is added to its filter's output.
     z : by agent, (runs, steps, p) what it measured; anything where it measured nothing.
     relations : by pair of agents, (runs, steps, p) what one measured of the other.
@@ -86,12 +86,14 @@ class Readings:
         z: Sequence[np.ndarray],
         relations: Mapping[tuple[int, int], np.ndarray] | None = None,
         functions: Sequence[Function | None] = (),
+        first: Sequence[np.ndarray | None] = (),
     ) -> Readings:
         """Put what was measured beside what the filters are told.
 
         Parameters
         ----------
         z, relations, functions : see the class.
+        first : by agent, (runs, d, 1) first estimates of the state; default, and for None: the scenario's initial.x.
 
         Raises
         ------
@@ -103,12 +105,16 @@ class Readings:
         if system.filters:
             shapes = [(f.M, f.s) for f in system.filters]
         into = [np.linalg.pinv(M) for M, _ in shapes]
-        x0 = np.concatenate([turn @ (system.x0 - s) for turn, (_, s) in zip(into, shapes, strict=True)])
+        runs, steps = z[0].shape[:2]
+        starts = [
+            np.broadcast_to(system.x0 if x is None else x, (runs, *system.x0.shape))
+            for x in first or [None] * len(into)
+        ]
+        x0 = np.concatenate([turn @ (x - s) for turn, (_, s), x in zip(into, shapes, starts, strict=True)], axis=1)
         if model.Bu.any() and any(M.shape[0] != M.shape[1] for M, _ in shapes):
             raise UsageError("model.B and u: expected no known input beside filters of a part of the state, got one")
         inputs = np.concatenate([turn @ model.Bu for turn in into], axis=-2)
         functions = tuple(functions) or (None,) * system.agents
-        runs, steps = z[0].shape[:2]
         H = tuple(
             np.zeros((0,)) if f is None else np.zeros((runs, steps, *at_step(seen, 1).shape))
             for f, seen in zip(functions, world.H, strict=True)
@@ -123,7 +129,7 @@ class Readings:
 
     def start(self, rows: slice) -> np.ndarray:
         """First estimates."""
-        return self.x0[rows]
+        return self.x0[self.runs, rows]
 
     def process(self, step: int, rows: slice) -> np.ndarray:
         """Known input."""
@@ -426,8 +432,7 @@ class SumNumbers:
         for kind in set(kinds.tolist()):
             here = np.flatnonzero(kinds == kind)
             if kind == START:
-                start = self._sources.starts[0]
-                out[here] = np.concatenate([start.Y, start.y], axis=-1)
+                out[here] = self._start(of[here], runs[here])
             elif kind == MEASURED:
                 for source in np.unique(of[here]).tolist():
                     mine = here[of[here] == source]
@@ -437,6 +442,12 @@ class SumNumbers:
             else:
                 out[here] = self._gathered(self.pairs.key(of[here], runs[here]))
         return out
+
+    def _start(self, sources: np.ndarray, runs: np.ndarray) -> np.ndarray:
+        Y, x = self._sources.starts[0].Y, self.readings.x0.reshape(self.pairs.runs, -1, self.system.dimension, 1)
+        # a common first estimate is any agent's
+        y = Y @ x[runs, np.maximum(sources, 0)]
+        return np.concatenate([np.broadcast_to(Y, (len(runs), *Y.shape)), y], axis=-1)
 
     def _measured(self, step: int, source: int, runs: np.ndarray) -> np.ndarray:
         sensor, d = self.system.sensors[self.system.sensor_of[source]].at(step), self.system.dimension

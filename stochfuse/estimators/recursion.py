@@ -172,7 +172,8 @@ class RecursiveEstimator:
     def first(self, rows: slice) -> Worked:
         """First estimate of some rows of the stacked state, as a batch of one."""
         P = self.world.P0[rows, rows][None]
-        return Worked(P, None if self.riding is None else self.riding.start(rows)[None], np.zeros_like(P))
+        x = None if self.riding is None else self.riding.start(rows)
+        return Worked(P, x if x is None or x.ndim > 2 else x[None], np.zeros_like(P))
 
     def prior(self, step: int, agent: int, before: Worked) -> Estimate:
         """Time update of an agent's estimates."""

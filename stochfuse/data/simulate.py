@@ -1,0 +1,148 @@
+"""Simulate a scenario: draw truth, measurements and arrivals, and run estimators on them, beside the prediction.
+
+What is drawn: `stochfuse.data.draw`.  The estimators are those of every other engine, on data
+(`stochfuse.engines.replay`); with sensors by name the truth is measured by the true functions, and the filters are
+extended ones, so that the realised error says how far the linearisation of a prediction carries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from stochfuse.data.draw import drawn, drawn_arrivals
+from stochfuse.data.records import NUMBERS, Batch
+from stochfuse.data.run import RunResult, Way, run_records
+from stochfuse.data.writing import ARRIVALS, ESTIMATES, FIRST, MEASUREMENTS, TRUTH, EstimatesFile, RecordFiles
+from stochfuse.errors import UsageError
+from stochfuse.kalman.metrics import Metric
+from stochfuse.scenario.network import LinkRows
+from stochfuse.scenario.scenario import Scenario, link_rows
+
+FILES = (MEASUREMENTS, ARRIVALS, TRUTH, FIRST, ESTIMATES)
+DEPARTS = 1e-6
+"""Largest part of its size by which a nominal path may depart from the model without a word."""
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """Records that are drawn, in the form of those that are read (`stochfuse.data.records.Records`).
+
+    Parameters
+    ----------
+    scenario : what is simulated.
+    names : of the runs.
+    links : one row of link probabilities.
+    seed : of everything.
+    files : where they are written to, or None.
+    """
+
+    scenario: Scenario
+    names: tuple[str, ...]
+    links: LinkRows
+    seed: int
+    files: RecordFiles | None = None
+    given: bool = True
+    """Whether arrivals come with the records."""
+
+    @property
+    def known(self) -> np.ndarray:
+        """States of which the truth is known: all."""
+        return np.arange(self.scenario.model.dimension)
+
+    @property
+    def with_truth(self) -> bool:
+        """Whether the truth is known."""
+        return True
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What should be known of the draws."""
+        nominal, model = self.scenario.nominal, self.scenario.system.model
+        if nominal is None or len(model.F) < 2:
+            return ()
+        nominal = nominal[: len(model.F)]
+        moved = (model.F[1:] @ nominal[:-1, :, None] + model.Bu[1:])[..., 0]
+        off = float(np.abs(moved - nominal[1:]).max())
+        if off <= DEPARTS * float(np.abs(nominal).max()):
+            return ()
+        return (f"the truth follows the model; the nominal path departs from it by up to {off:.3g} in a step",)
+
+    def batches(self) -> Iterator[Batch]:
+        """Draw some runs at a time."""
+        system, runs = self.scenario.system, len(self.names)
+        size = max(1, NUMBERS // (system.agents * system.steps))
+        nominal = self.scenario.nominal
+        start = system.x0 if nominal is None else nominal[0][:, None]
+        for first in range(0, runs, size):
+            count = min(size, runs - first)
+            found = drawn(system, self.scenario.instruments, start, count, self.seed, first)
+            arrivals = drawn_arrivals(system, self.links, found.missed, self.seed, first)
+            batch = Batch(
+                np.arange(first, first + count),
+                tuple(np.nan_to_num(z) for z in found.z),
+                found.relations,
+                arrivals,
+                found.missed,
+                found.truth,
+                found.first,
+            )
+            if self.files is not None:
+                seen = [~np.isnan(z[..., 0]) for z in found.z]
+                self.files.write(batch, self.names[first : first + count], seen.__getitem__)
+            yield batch
+
+
+def simulate(
+    scenario: Scenario,
+    metric: Metric,
+    way: Way,
+    runs: int = 1,
+    folder: Path | None = None,
+    *,
+    force: bool = False,
+) -> RunResult:
+    """Simulate runs of a scenario.
+
+    Parameters
+    ----------
+    metric : what errors are shown in.
+    way : estimators, link probability, and the seed of everything.
+    runs : how many.
+    folder : where truth, measurements, arrivals, first estimates and estimates are written; made if need be.
+    force : whether files that are there may be replaced.
+
+    Raises
+    ------
+    UsageError
+        If the scenario has no one link probability, or the folder has such files already.
+    """
+    if runs < 1:
+        raise UsageError(f"runs: expected at least 1, got {runs}")
+    links = link_rows(scenario, None if way.link is None else [way.link])
+    if len(links.link) != 1:
+        raise UsageError(f"link: expected one link probability to simulate, got {len(links.link)}; give --link")
+    draws = Draws(scenario, tuple(str(i + 1) for i in range(runs)), links, way.seed)
+    if folder is None:
+        return run_records(draws, metric, way)
+    _check_folder(folder, force)
+    with ExitStack() as stack:
+        files = stack.enter_context(RecordFiles(folder, scenario))
+        estimates = stack.enter_context(EstimatesFile(folder / ESTIMATES, scenario, truth=True))
+        return run_records(replace(draws, files=files), metric, way, estimates.write)
+
+
+def _check_folder(folder: Path, force: bool) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"cannot make the folder {folder}: {error.strerror or error}") from None
+    there = [name for name in FILES if (folder / name).exists()]
+    if there and not force:
+        raise UsageError(
+            f"{folder}: expected a folder without {', '.join(there)}, which would be replaced; see --force"
+        )
