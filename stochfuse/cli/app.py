@@ -23,6 +23,8 @@ COMMANDS = (
     "messages",
     "derive",
     "graph",
+    "run",
+    "simulate",
     "crosscheck",
     "reproduce",
     "study",

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from stochfuse.cli.options import NETWORK, OUTPUT, SHOWN, Written, option, steps_at
+from stochfuse.cli.options import NETWORK, OUTPUT, SHOWN, Written, option, pairs, steps_at
 from stochfuse.errors import UsageError
 
 EXAMPLES = (
@@ -69,7 +69,7 @@ def links(
     elif at is not None:
         raise UsageError("--at: expected a scenario to go with it, got a file of links")
     else:
-        found = read_links(file, columns=_pairs(columns), sent=sent, step=step)
+        found = read_links(file, columns=pairs("--columns", columns), sent=sent, step=step)
     if nodes is not None:
         found = found.of([node.strip() for node in nodes.split(",")])
     for note in found.notes:
@@ -81,13 +81,3 @@ def links(
     if write is not None:
         write_text(network_table(found), write)
     to.write(links_report(found, steps))
-
-
-def _pairs(text: str | None) -> dict[str, str]:
-    found = {}
-    for part in text.split(",") if text else ():
-        ours, equals, theirs = part.partition("=")
-        if not equals:
-            raise UsageError(f"--columns: expected OURS=THEIRS, got '{part}'")
-        found[ours.strip()] = theirs.strip()
-    return found

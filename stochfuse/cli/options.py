@@ -402,6 +402,43 @@ def quantity_names(text: str) -> list[str]:
     return names
 
 
+def estimator_names(text: str) -> tuple[str, ...]:
+    """Return the estimators of `naive` or `naive,optimal`.
+
+    Raises
+    ------
+    UsageError
+        If one is unknown or named twice.
+    """
+    names = tuple(name.strip() for name in text.split(","))
+    for name in names:
+        if name not in ESTIMATORS:
+            known = ", ".join(ESTIMATORS)
+            raise UsageError(
+                f"--estimator: expected one or several of {known}, got '{name}'{nearest(name, ESTIMATORS)}"
+            )
+    if len(set(names)) < len(names):
+        raise UsageError(f"--estimator: expected different ones, got {text}")
+    return names
+
+
+def pairs(flag: str, text: str | None) -> dict[str, str]:
+    """Return the names of `OURS=THEIRS,OURS=THEIRS`.
+
+    Raises
+    ------
+    UsageError
+        If a part is no such pair.
+    """
+    found = {}
+    for part in text.split(",") if text else ():
+        ours, equals, theirs = part.partition("=")
+        if not equals:
+            raise UsageError(f"{flag}: expected OURS=THEIRS, got '{part}'")
+        found[ours.strip()] = theirs.strip()
+    return found
+
+
 BYTES = {"table": 1000, "markdown": 1000, "latex": 1000, "csv": 200, "json": 200}
 """Memory that a number takes on its way to the reader."""
 

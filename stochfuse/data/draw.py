@@ -44,7 +44,7 @@ class Drawn(NamedTuple):
     truth : (runs, steps, agents, d) true states.
     z : by agent, (runs, steps, p) measurements; NaN where nothing was measured.
     relations : by pair of agents, (runs, steps, p) what one measured of the other.
-    missed : (runs, steps, agents) whether a sensor that looked saw nothing.
+    missed : (runs, steps, agents) whether an agent that has a sensor measured nothing, unless by its very H.
     first : by agent, (runs, d, 1) first estimates.
     """
 
@@ -126,6 +126,10 @@ def drawn(
     measured = tuple(np.concatenate(each) for each in zip(*z, strict=True))
     for agent, each in enumerate(measured):
         each[missed[:, :, agent]] = np.nan
+        if (
+            functions[agent] is not None
+        ):  # whose matrices are those of the estimate, also where the nominal path has none
+            missed[:, 1:, agent] = np.isnan(each[:, 1:, 0])
     return Drawn(
         np.concatenate(truth),
         measured,

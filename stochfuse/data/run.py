@@ -141,6 +141,7 @@ class RunResult(Result):
     metric : what is shown.
     runs : number of runs.
     drawn : whether arrivals were drawn.
+    simulated : whether everything was.
     rows : one for each estimator and agent, and for the mean over the agents.
     traces : each estimator over the steps.
     heard : (steps, agents, agents) what arrived in the first run at once, receiver × sender, itself not counted.
@@ -155,6 +156,7 @@ class RunResult(Result):
     traces: tuple[Trace, ...]
     heard: np.ndarray
     notes: tuple[str, ...] = ()
+    simulated: bool = False
 
 
 class Estimates(NamedTuple):

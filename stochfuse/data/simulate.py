@@ -128,12 +128,12 @@ def simulate(
         raise UsageError(f"link: expected one link probability to simulate, got {len(links.link)}; give --link")
     draws = Draws(scenario, tuple(str(i + 1) for i in range(runs)), links, way.seed)
     if folder is None:
-        return run_records(draws, metric, way)
+        return replace(run_records(draws, metric, way), simulated=True)
     _check_folder(folder, force)
     with ExitStack() as stack:
         files = stack.enter_context(RecordFiles(folder, scenario))
         estimates = stack.enter_context(EstimatesFile(folder / ESTIMATES, scenario, truth=True))
-        return run_records(replace(draws, files=files), metric, way, estimates.write)
+        return replace(run_records(replace(draws, files=files), metric, way, estimates.write), simulated=True)
 
 
 def _check_folder(folder: Path, force: bool) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from typing import Any
 
+from stochfuse.data.run import RunResult
 from stochfuse.errors import UsageError, needed
 from stochfuse.estimators.fusion_graph import FusionGraph
 from stochfuse.kalman.metrics import metric
@@ -21,6 +22,7 @@ from stochfuse.report import comparisons, fusion_graph, links, messages, predict
 from stochfuse.report.critical import critical_report
 from stochfuse.report.plot import figure_class
 from stochfuse.report.predictions import PredictionView
+from stochfuse.report.runs import run_report
 from stochfuse.report.table import Report, to_html, to_text
 from stochfuse.scenario.links import Links
 from stochfuse.scenario.over import Over
@@ -54,6 +56,8 @@ def report_of(result: Any, of: str | None = None, agent: int | str = "mean") -> 
         return study_figures.summary_report(result, 5)
     if isinstance(result, Links):
         return links.links_report(result)
+    if isinstance(result, RunResult):
+        return run_report(result)
     scenario = (result if isinstance(result, Prediction | Swept) else result.predictions[0]).scenario
     chosen = metric(of or scenario.metric or "trace", scenario.model)
     if isinstance(result, EstimatorComparison):

@@ -1,0 +1,74 @@
+"""`stochfuse simulate`: truth, measurements, arrivals and estimates, as files and beside the prediction."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stochfuse.cli.options import (
+    OUTPUT,
+    RARE,
+    WORK,
+    Changes,
+    DigitsOption,
+    FormatOption,
+    MetricOption,
+    PlotOption,
+    ScenarioArgument,
+    check_files,
+    estimator_names,
+    option,
+)
+from stochfuse.cli.run import CriterionOption, EstimatorsOption, one_link, show
+from stochfuse.errors import UsageError
+from stochfuse.scenario.registry import LFG
+
+EXAMPLES = (
+    "stochfuse simulate thesis-steady --link 0.5 --runs 200 --seed 1 --output folder",
+    "stochfuse simulate two-radars --link 0.5 --runs 50 --estimator local-fusion-graph,stand-alone",
+)
+
+
+def simulate(
+    scenario: ScenarioArgument = "thesis-transient",
+    changes: Changes = Changes(),
+    runs: Annotated[int, option("Independent runs; default: 1.", WORK, min=1, metavar="N")] = 1,
+    seed: Annotated[int, option("Of all random numbers; default: 1.", WORK, min=0, metavar="N")] = 1,
+    estimator: EstimatorsOption = LFG,
+    criterion: CriterionOption = "det",
+    metric: MetricOption = None,
+    format: FormatOption = None,
+    output: Annotated[
+        Path | None,
+        option(
+            "Folder for measurements.csv, arrivals.csv, truth.csv, initial.csv and estimates.csv.",
+            OUTPUT, "--output", "-o", metavar="FOLDER",
+        ),
+    ] = None,
+    force: Annotated[bool, option("Replace such files in the folder.", OUTPUT + RARE, "--force")] = False,
+    plot: PlotOption = None,
+    digits: DigitsOption = 5,
+) -> None:  # fmt: skip
+    """Draw truth, measurements and arrivals, run estimators on them, and lay their errors beside the prediction.
+
+    Sensors by name measure by their true functions, and the filters are extended ones: the realised error says how
+    far the linearisation of a prediction carries.
+    """
+    from stochfuse.data.run import Way
+    from stochfuse.data.simulate import simulate as simulated
+    from stochfuse.kalman.metrics import metric as metric_of
+
+    names = estimator_names(estimator)
+    if output is not None and output.exists() and not output.is_dir():
+        raise UsageError(f"--output: expected a folder, got the file {output}")
+    check_files(None, plot, scenario)
+    given, links = changes.of(scenario)
+    chosen = metric_of(metric or given.metric or "trace", given.model)
+    found = simulated(given, chosen, Way(names, one_link(links), seed, criterion), runs, output, force=force)
+    show(found, format, plot, digits)
+    if output is not None:
+        typer.echo(
+            f"note: written to {output}: run the same with --measurements {output / 'measurements.csv'}", err=True
+        )

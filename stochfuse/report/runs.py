@@ -1,0 +1,237 @@
+"""What estimators made of records: realised, claimed and predicted errors, consistency, and each over the steps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from stochfuse import __version__
+from stochfuse.data.consistency import Average
+from stochfuse.data.run import Row, RunResult, Trace
+from stochfuse.report.plot import COLORS, DASHES, below, figure_class, titled
+from stochfuse.report.table import Report, Table, number, to_csv
+
+SCHEMA = "stochfuse.run/1"
+MOST_AGENTS = 6
+"""Agents that a table shows one by one, and a figure draws."""
+
+
+def run_report(found: RunResult, digits: int = 5) -> Report:
+    """Return a run in every form."""
+    return Report(
+        lambda: run_tables(found, digits), lambda: run_csv(found), lambda: run_json(found), lambda: draw(found)
+    )
+
+
+def _titles(found: RunResult) -> tuple[str, ...]:
+    network, metric = found.scenario.network, found.metric
+    unit = f" [{metric.unit}]" if metric.unit else ""
+    arrivals = "arrivals drawn from the links" if found.drawn else "arrivals as recorded"
+    runs = f"{found.runs:,} run{'s' * (found.runs != 1)} of {network.steps:,} steps"
+    truth = any(row.realised is not None for row in found.rows)
+    return (
+        f"Estimators on data of {found.scenario.name}: {metric.label}{unit}; posterior, mean over steps",
+        f"{network.agents} agents, {runs}, {arrivals}",
+        "realised: x̂ − x, sampled; predicted: over noises and arrivals; given: over noises, for these arrivals"
+        if truth
+        else "the truth is not known: no realised error, no NEES",
+    )
+
+
+def run_tables(found: RunResult, digits: int = 5) -> list[Table]:
+    """Return errors, and averages of NEES and NIS, each with a row for every estimator and agent."""
+    rows, keys = _shown(found), ("estimator", "agent")
+    errors = tuple(
+        (*_named(row), *(_number(value, digits) for value in (row.realised, row.claimed, row.predicted, row.given)))
+        for row in rows
+    )
+    tables = [Table((*_titles(found), *_beside(found)), keys, ("realised", "claimed", "predicted", "given"), errors)]
+    about = {"NEES": "of x̂ − x, where the truth is known", "NIS": "of innovations, about predictions of the claim"}
+    for name, averages in (("NEES", [row.nees for row in rows]), ("NIS", [row.nis for row in rows])):
+        lines = tuple(
+            (*_named(row), *_average(average), average.verdict)
+            for row, average in zip(rows, averages, strict=True)
+            if average is not None
+        )
+        title = f"{name} {about[name]}: the average, and what a consistent filter keeps 95 times in 100"
+        if lines:
+            tables.append(Table((title,), keys, (name, "from", "to", "verdict"), lines))
+    return tables
+
+
+def _beside(found: RunResult) -> tuple[str, ...]:
+    """How far predictions are from what was realised, and by what they were made."""
+    means = [row for row in found.rows if row.agent is None or found.scenario.network.agents == 1]
+    away = [f"{row.estimator} {_share(row)}" for row in means if row.realised and row.predicted is not None]
+    made = [f"{row.estimator} by {row.method}" for row in means if row.method]
+    lines = (
+        f"prediction {', '.join(away)} simulated" if found.simulated else f"prediction {', '.join(away)} realised",
+    )
+    return (lines if away else ()) + ((f"predicted: {'; '.join(made)}",) if made else ())
+
+
+def _share(row: Row) -> str:
+    share = 100.0 * (row.predicted / row.realised - 1.0)  # type: ignore[operator]
+    return f"{abs(share):.2g} % {'below' if share < 0 else 'above'}"
+
+
+def _shown(found: RunResult) -> list[Row]:
+    if found.scenario.network.agents <= MOST_AGENTS:
+        return list(found.rows)
+    return [row for row in found.rows if row.agent is None]
+
+
+def _named(row: Row) -> tuple[str, str]:
+    return row.estimator, "mean" if row.agent is None else str(row.agent)
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "" if value is None else number(value, digits)
+
+
+def _average(average: Average) -> tuple[str, str, str]:
+    return number(average.mean, 4), number(average.low, 4), number(average.high, 4)
+
+
+HEADINGS = ("estimator", "agent", "link", "realised", "claimed", "predicted", "given_arrivals", "method", "nees")
+MORE = ("nees_low", "nees_high", "nis", "nis_low", "nis_high", "verdict", "metric", "runs", "steps")
+
+
+def run_csv(found: RunResult) -> str:
+    """One line for every estimator and agent; agent is empty for the mean over the agents."""
+    rows = []
+    for row in found.rows:
+        values = (row.estimator, row.agent, row.link, row.realised, row.claimed, row.predicted, row.given, row.method)
+        line = (*values, *_ends(row.nees), *_ends(row.nis), row.verdict, found.metric.name, found.runs)
+        rows.append(tuple("" if value is None else value for value in (*line, found.scenario.network.steps)))
+    return to_csv((*HEADINGS, *MORE), rows)
+
+
+def _ends(average: Average | None) -> tuple[float | None, float | None, float | None]:
+    return (None, None, None) if average is None else (average.mean, average.low, average.high)
+
+
+def run_json(found: RunResult) -> dict[str, Any]:
+    """Return the object of schema stochfuse.run/1; what cannot be known is null."""
+    rows = []
+    for row in found.rows:
+        nees, nees_low, nees_high = _ends(row.nees)
+        nis, nis_low, nis_high = _ends(row.nis)
+        rows.append(
+            {
+                "estimator": row.estimator,
+                "agent": row.agent,
+                "link": row.link,
+                "realised": row.realised,
+                "claimed": row.claimed,
+                "predicted": row.predicted,
+                "given_arrivals": row.given,
+                "method": row.method or None,
+                "nees": nees,
+                "nees_low": nees_low,
+                "nees_high": nees_high,
+                "nis": nis,
+                "nis_low": nis_low,
+                "nis_high": nis_high,
+                "verdict": row.verdict,
+            }
+        )
+    return {
+        "schema": SCHEMA,
+        "version": __version__,
+        "metric": found.metric.name,
+        "runs": found.runs,
+        "steps": found.scenario.network.steps,
+        "arrivals": "drawn" if found.drawn else "recorded",
+        "rows": rows,
+        "scenario": found.scenario.to_mapping(),
+        "meta": {"description": list(_titles(found)), "notes": list(found.notes)},
+    }
+
+
+def draw(found: RunResult) -> Any:
+    """Return the figure: error and ±2σ of every agent over the steps, below it what arrived, and NEES with its band."""
+    n = found.scenario.network.agents
+    agents = range(min(n, MOST_AGENTS))
+    columns = min(len(agents), 3)
+    rows = -(-len(agents) // columns)
+    nees = any(not np.isnan(trace.nees).all() for trace in found.traces)
+    heights = [3.0, 1.0] * rows + ([2.2] if nees else [])
+    figure = figure_class()(figsize=(4.2 * columns + 0.6, 0.95 * sum(heights) + 1.6), layout="constrained")
+    grid = figure.add_gridspec(len(heights), columns, height_ratios=heights)
+    handles: list[Any] = []
+    for place, agent in enumerate(agents):
+        row, column = 2 * (place // columns), place % columns
+        above = figure.add_subplot(grid[row, column])
+        lines = _errors(above, found, agent)
+        handles = handles or lines
+        _arrived(figure.add_subplot(grid[row + 1, column], sharex=above), found, agent)
+    if nees:
+        _nees(figure.add_subplot(grid[len(heights) - 1, :]), found)
+    below(figure, handles)
+    what = f"of the first of {found.runs:,} runs" if found.runs > 1 else "of the run"
+    titled(figure, *_titles(found)[:2], f"errors and ±2σ (grey: {found.traces[0].estimator}) {what}")
+    return figure
+
+
+def _errors(axes: Any, found: RunResult, agent: int) -> list[Any]:
+    """Errors of an agent, or its estimates where the truth is not known, with ±2σ of the first estimator."""
+    state = found.metric.states[0] if found.metric.states else 0
+    model = found.scenario.model
+    known = not np.isnan(found.traces[0].truth[:, :, state]).all()
+    k = np.arange(1, found.scenario.network.steps + 1)
+    for place, trace in enumerate(found.traces):
+        shown = _of(trace, agent, state, known)
+        if place == 0:
+            sigma = 2.0 * np.sqrt(trace.variance[:, agent, state])
+            middle = np.zeros_like(sigma) if known else shown
+            axes.fill_between(k, middle - sigma, middle + sigma, color="0.85", label="±2σ claimed", linewidth=0)
+        style = {"color": COLORS[place % len(COLORS)], "linestyle": DASHES[place % len(DASHES)]}
+        axes.plot(k, shown, linewidth=1.3, label=trace.estimator, **style)
+    unit = model.units[state]
+    name = f"{'error of ' if known else ''}{model.states[state]}"
+    axes.set_ylabel(f"{name} [{unit}]" if unit else name)
+    names = found.scenario.network.names
+    axes.set_title(f"agent {names[agent] if names else agent + 1}", fontsize="small")
+    axes.tick_params(labelbottom=False)
+    axes.grid(alpha=0.3)
+    return axes.get_legend_handles_labels()[0]
+
+
+def _of(trace: Trace, agent: int, state: int, known: bool) -> np.ndarray:
+    x = trace.x[:, agent, state]
+    return x - trace.truth[:, min(agent, trace.truth.shape[1] - 1), state] if known else x
+
+
+def _arrived(axes: Any, found: RunResult, agent: int) -> None:
+    """What an agent heard, a row for each sender."""
+    n = found.heard.shape[1]
+    senders = [j for j in range(n) if j != agent]
+    heard = found.heard[:, agent][:, senders].T
+    sender, step = np.nonzero(heard)
+    size = max(0.6, min(6.0, 120.0 / found.scenario.network.steps))
+    axes.plot(step + 1, sender, "s", color="k", markersize=size, linestyle="none")
+    names = found.scenario.network.names or [str(j + 1) for j in range(n)]
+    if len(senders) <= MOST_AGENTS:
+        axes.set_yticks(range(len(senders)), [names[j] for j in senders], fontsize="x-small")
+    axes.set_ylim(len(senders) - 0.5, -0.5)
+    axes.set_ylabel("heard", fontsize="small")
+    axes.set_xlabel("step k")
+
+
+def _nees(axes: Any, found: RunResult) -> None:
+    """Averages over runs and agents, with what they keep if the agents of a run are one."""
+    k = np.arange(1, found.scenario.network.steps + 1)
+    for place, trace in enumerate(found.traces):
+        style = {"color": COLORS[place % len(COLORS)], "linestyle": DASHES[place % len(DASHES)]}
+        axes.plot(k, trace.nees, linewidth=1.3, **style)
+        if place == 0:
+            axes.fill_between(k, *trace.band.T, color="0.85", linewidth=0)
+    top = max(float(np.nanmax(trace.nees)) for trace in found.traces)
+    if top > 20.0 * float(np.nanmax(found.traces[0].band)):
+        axes.set_yscale("log")
+    axes.set_xlabel("step k")
+    axes.set_ylabel("NEES")
+    axes.grid(alpha=0.3)
+    axes.set_title("NEES, mean over runs and agents (grey: where 95 % of consistent filters' lie)", fontsize="small")
