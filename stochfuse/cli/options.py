@@ -116,8 +116,8 @@ AgentOption = Annotated[
 QuantityOption = Annotated[
     str,
     option(
-        f"{', '.join(QUANTITIES)}; several side by side: claimed,actual. Default: claimed.", SHOWN, metavar="NAME",
-        autocompletion=completed(QUANTITIES),
+        f"{', '.join(QUANTITIES)}; several: claimed,actual; {registry.STATE} of measurements. Default: claimed.", SHOWN,
+        metavar="NAME", autocompletion=completed((*QUANTITIES, registry.STATE)),
     ),
 ]  # fmt: skip
 
@@ -396,6 +396,8 @@ def quantity_names(text: str) -> list[str]:
     for name in names:
         if name not in QUANTITIES:
             known = ", ".join(QUANTITIES)
+            if name == registry.STATE:
+                raise UsageError(f"--quantity: expected {name} by itself, and of predict, got {text}")
             raise UsageError(f"--quantity: expected one or several of {known}, got '{name}'{nearest(name, QUANTITIES)}")
     if len(set(names)) < len(names):
         raise UsageError(f"--quantity: expected different ones, got {text}")

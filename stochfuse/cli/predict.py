@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -31,7 +31,7 @@ from stochfuse.cli.options import (
     whose,
 )
 from stochfuse.errors import UsageError
-from stochfuse.scenario.registry import GENERAL, NAIVE, SIMPLIFIED
+from stochfuse.scenario.registry import GENERAL, NAIVE, SIMPLIFIED, STATE
 
 if TYPE_CHECKING:
     from stochfuse.report.predictions import PredictionView
@@ -48,6 +48,10 @@ def predict(
     changes: Changes = Changes(),
     over: OverOption = None,
     quantity: QuantityOption = "claimed",
+    measurements: Annotated[
+        str | None,
+        option("With --quantity state: CSV, Parquet or -: step, agent, z1, z2, …", SHOWN, metavar="FILE"),
+    ] = None,
     metric: MetricOption = None,
     statistic: Annotated[
         str,
@@ -82,7 +86,19 @@ def predict(
     from stochfuse.prediction.quantities import check
     from stochfuse.report.predictions import PredictionView, report
 
-    to.check(scenario)
+    to.check(scenario, *([] if measurements is None else [measurements]))
+    if quantity == STATE:
+        flags = {"--over": over, "--metric": metric, "--normalise": normalise, "--steady": steady}
+        flags |= {"--interval": interval, "--statistic": statistic != "mean"}
+        for flag, value in flags.items():
+            if value:
+                raise UsageError(f"{flag}: expected without --quantity {STATE}")
+        way = method or (SIMPLIFIED if estimator is None else GENERAL)
+        settings = settings_for([way], **{"estimator": estimator, **sampling._asdict(), **graphs._asdict()})
+        _states(scenario, changes, measurements, StatesAsked(way, agent, at), settings, to)
+        return
+    if measurements is not None:
+        raise UsageError(f"--measurements: expected --quantity {STATE} to go with it, got {quantity}")
     quantities = quantity_names(quantity)
     given, links = changes.of(scenario)
     swept = changes.over(over, given)
@@ -126,6 +142,42 @@ def predict(
         view.values()  # a request that cannot be met should say so before notes and figures
     _warn(views)
     to.write(report(views))
+
+
+class StatesAsked(NamedTuple):
+    """How expected states are asked for."""
+
+    method: str
+    agent: str | None
+    at: str | None
+
+
+def _states(
+    scenario: str,
+    changes: Changes,
+    measurements: str | None,
+    asked: StatesAsked,
+    settings: dict[str, Any],
+    to: Written,
+) -> None:
+    """Show the expected state over what arrives, given one record of measurements."""
+    from stochfuse.data.records import read_records
+    from stochfuse.prediction.expected_states import expected_states
+    from stochfuse.report.states import StatesView, states_report
+
+    if measurements is None:
+        raise UsageError(f"--quantity {STATE}: expected --measurements FILE to go with it")
+    if scenario == measurements == "-":
+        raise UsageError("SCENARIO and --measurements: expected at most one of them on standard input, got - for both")
+    given, links = changes.of(scenario)
+    records = read_records(given, measurements)
+    agent, steps = whose(asked.agent, records.scenario), steps_at(asked.at, records.scenario)
+    if agent in ("worst", "best"):
+        raise UsageError(f"--agent: expected mean or a number with --quantity {STATE}, got {agent}")
+    found = expected_states(records.scenario, records.one_run(), links, asked.method, **settings)
+    for note in records.notes:
+        typer.echo(f"note: {note}", err=True)
+    to.write(states_report(StatesView(found, agent, steps, to.digits)))
 
 
 def _warn(views: tuple[PredictionView, ...]) -> None:

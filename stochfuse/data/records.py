@@ -124,6 +124,23 @@ class Records:
         for first in range(0, len(self.names), size):
             yield self._batch(slice(first, min(first + size, len(self.names))))
 
+    def one_run(self) -> np.ndarray:
+        """Return the measurements of the only run, (steps, agents, p), NaN where there are none.
+
+        Raises
+        ------
+        UsageError
+            If there are several runs.
+        """
+        if len(self.names) > 1:
+            raise UsageError(f"measurements: expected one run, got {len(self.names)}: {', '.join(self.names[:5])}, …")
+        system = self.scenario.system
+        widths = [self.scenario.sensors[kind].H.shape[-2] for kind in self.scenario.sensor_of]
+        out = np.full((system.steps, system.agents, max([*widths, 1])), np.nan)
+        _, where, values = self.measurements.of(slice(0, 1))
+        out[where[:, 0], where[:, 1]] = values[:, : out.shape[2]]
+        return out
+
     def _batch(self, runs: slice) -> Batch:
         system = self.scenario.system
         count, steps, n, d = runs.stop - runs.start, system.steps, system.agents, system.dimension

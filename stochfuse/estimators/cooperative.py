@@ -157,7 +157,7 @@ class Itns(RecursiveEstimator):
             z = None
             if self.readings is not None:
                 z = self.readings.related(step, pair)
-                z = z[here] if z.ndim > 2 else z
+                z = z[here] if z.ndim > 2 and len(z) == len(here) else z
             elif x is not None:
                 z = np.zeros((len(H), x.shape[-1]))
                 if self.world.own:

@@ -16,6 +16,7 @@ import numpy as np
 from stochfuse.errors import UsageError
 from stochfuse.estimators.ledger import InformationClaims, Ledger, Sources, evaluate
 from stochfuse.estimators.protocol import Made
+from stochfuse.estimators.readings import Readings
 from stochfuse.estimators.recursion import PastClaims, Pasts, RecursiveEstimator
 from stochfuse.estimators.world import World, error_sources, sources_of, world_of
 from stochfuse.scenario import capabilities, registry
@@ -42,7 +43,8 @@ def make(
     name : one of `stochfuse.prediction.predict.ESTIMATORS`.
     relabellings : permutations of the agents that change nothing; None if nobody may change places.
     errors : whether noise footprints are carried along, see `stochfuse.estimators.world`.
-    records : measurements (steps, agents, p) where states are wanted, for estimators of sums of information.
+    records : measurements (steps, agents, p) where states are wanted; of agents that measure less than others what
+        is too much does not matter.
     criterion : what the weights of an intersection minimise: "det", "trace" or "max-eig".
 
     Raises
@@ -55,12 +57,12 @@ def make(
         _check_footprints(system, name)
     entry, rule = registry.estimator(name), rule_of(name)
     if not entry.sums:
-        if records is not None:
-            raise UsageError(f"estimator {name}: its states cannot be had for a record of measurements")
         more = {"criterion": criterion} if entry.weighs else {}
         build = partial(rule, kinds=system.labels, relabellings=relabellings, errors=errors, **more)
+        if records is not None:  # which tell like agents apart
+            build = partial(rule, kinds=range(system.agents), relabellings=relabellings, errors=True, **more)
         estimator = build(world_of(system))
-        return Made(name, estimator, partial(_of_pasts, build, estimator.pasts))
+        return Made(name, estimator, partial(_of_pasts, build, estimator.pasts, records))
     everyone = tuple(range(system.agents))
     # records tell like agents apart; footprints only say whose noise is whose
     labels = everyone if errors or records is not None else system.sensor_of
@@ -87,11 +89,21 @@ def rule_of(name: str) -> Any:
     return getattr(import_module(f"stochfuse.estimators.{file}"), kind)
 
 
-def _of_pasts(build: Callable[[World], RecursiveEstimator], pasts: Pasts, system: System, noises: Noises) -> PastClaims:
+def _of_pasts(
+    build: Callable[[World], RecursiveEstimator],
+    pasts: Pasts,
+    records: np.ndarray | None,
+    system: System,
+    noises: Noises,
+) -> PastClaims:
     if not noises.common:
         raise UsageError("an estimator of pasts takes one set of noises at a time")
     estimator = build(world_of(system))
     estimator.pasts = pasts
+    if records is not None:
+        widths = [H.shape[-2] for H in estimator.world.H]
+        z = [records[None, :, i, :width] for i, width in enumerate(widths)]
+        estimator.readings = Readings.given(system, z)
     return PastClaims(estimator)
 
 

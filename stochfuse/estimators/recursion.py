@@ -264,21 +264,25 @@ class PastClaims:
         self._row = np.zeros(len(estimator.pasts.step), dtype=int)
         steps: list[int] = []
         for step, rules, numbers in estimator.pasts.batches(estimator.mixed):
-            if steps and step > steps[-1]:
+            if steps and step > steps[-1] and estimator.readings is None:
                 self._settle([b for b, s in enumerate(steps) if s == step - 2])
             steps.append(step)
             rests_on = np.array([estimator.pasts.rests_on[n] for n in numbers], dtype=int).reshape(len(numbers), -1)
             worked = worked_out(estimator, step, rules, [self._gathered(column) for column in rests_on.T])
             self._batch[numbers], self._row[numbers] = len(self._worked), np.arange(len(numbers))
             self._worked.append(worked)
-        self._settle([b for b, s in enumerate(steps) if s >= steps[-1] - 1])
+        if estimator.readings is None:
+            self._settle([b for b, s in enumerate(steps) if s >= steps[-1] - 1])
         self.width, self._magnified = self._worked[-1].P[0].size, estimator.magnified
+        self._on_data = estimator.readings is not None
 
     def estimate(self, terms: Sequence[tuple[int, np.ndarray]], step: int) -> tuple[Estimate | Moments, float]:
         """Estimates of a step, with the moments of their errors if these were carried along; nothing is summed."""
         ((_, values),) = terms
         used, index = np.unique(values, return_inverse=True)
         found, index = self._gathered(used), index.reshape(np.shape(values))
+        if self._on_data:
+            return Estimate(found.x[index], found.P[index]), self._magnified
         moments = Moments(found.P) if found.actual is None else Moments.of(found.P, found.actual, found.bias)
         if not np.array_equal(used, values):
             moments = moments.map(lambda m: m[index])

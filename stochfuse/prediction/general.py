@@ -63,6 +63,19 @@ BLOCK = 1 << 20
 """Numbers that the values of a block of items take."""
 
 
+class Spread(NamedTuple):
+    """What is averaged of estimates on data: x (..., d, 1), their squares x xᵀ and P."""
+
+    x: np.ndarray
+    square: np.ndarray
+    P: np.ndarray
+
+
+def spread(estimate: Estimate) -> Spread:
+    """Average estimates and their squares."""
+    return Spread(estimate.x, estimate.x @ np.swapaxes(estimate.x, -1, -2), estimate.P)
+
+
 def itself(estimate: Estimate) -> Estimate:
     """Average estimates as they are."""
     return estimate
@@ -175,7 +188,7 @@ class Outcomes:
 
     @property
     def _of(self) -> Callable[[Estimate], Any]:
-        return moments if self.errors else itself
+        return moments if self.errors else itself if self.records is None else spread
 
     @cached_property
     def expectations(self) -> list[list[Any]]:
@@ -262,6 +275,12 @@ class Outcomes:
     def states(self) -> np.ndarray:
         """Expected state estimates, (rows, steps, groups, d, 1), (48)."""
         return self._stacked([[self._at(e.x, None) for e in step] for step in self.expectations])
+
+    def state_spread(self) -> np.ndarray:
+        """Covariance of the state estimates over the outcomes, (rows, steps, groups, d, d)."""
+        square = self._stacked([[self._at(e.square, None) for e in step] for step in self.expectations])
+        x = self.states()
+        return square - x @ np.swapaxes(x, -1, -2)
 
     def _stacked(self, by_step: list[list[np.ndarray]]) -> np.ndarray:
         stacked = np.stack([np.stack(by_group, axis=1) for by_group in by_step], axis=1)

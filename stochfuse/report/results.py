@@ -10,6 +10,7 @@ from stochfuse.errors import UsageError, needed
 from stochfuse.estimators.fusion_graph import FusionGraph
 from stochfuse.kalman.metrics import metric
 from stochfuse.prediction.compare import Comparison, EstimatorComparison
+from stochfuse.prediction.expected_states import ExpectedStates
 from stochfuse.prediction.result import Prediction
 from stochfuse.prediction.swept import Swept
 from stochfuse.questions.agents_needed import AgentsNeeded
@@ -23,6 +24,7 @@ from stochfuse.report.critical import critical_report
 from stochfuse.report.plot import figure_class
 from stochfuse.report.predictions import PredictionView
 from stochfuse.report.runs import run_report
+from stochfuse.report.states import StatesView, states_report
 from stochfuse.report.table import Report, to_html, to_text
 from stochfuse.scenario.links import Links
 from stochfuse.scenario.over import Over
@@ -58,6 +60,8 @@ def report_of(result: Any, of: str | None = None, agent: int | str = "mean") -> 
         return links.links_report(result)
     if isinstance(result, RunResult):
         return run_report(result)
+    if isinstance(result, ExpectedStates):
+        return states_report(StatesView(result, agent))
     scenario = (result if isinstance(result, Prediction | Swept) else result.predictions[0]).scenario
     chosen = metric(of or scenario.metric or "trace", scenario.model)
     if isinstance(result, EstimatorComparison):

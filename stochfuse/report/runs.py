@@ -218,6 +218,7 @@ def _arrived(axes: Any, found: RunResult, agent: int) -> None:
     axes.set_ylim(len(senders) - 0.5, -0.5)
     axes.set_ylabel("heard", fontsize="small")
     axes.set_xlabel("step k")
+    axes.xaxis.get_major_locator().set_params(integer=True)
 
 
 def _nees(axes: Any, found: RunResult) -> None:
@@ -232,6 +233,7 @@ def _nees(axes: Any, found: RunResult) -> None:
     if top > 20.0 * float(np.nanmax(found.traces[0].band)):
         axes.set_yscale("log")
     axes.set_xlabel("step k")
+    axes.xaxis.get_major_locator().set_params(integer=True)
     axes.set_ylabel("NEES")
     axes.grid(alpha=0.3)
     axes.set_title("NEES, mean over runs and agents (grey: where 95 % of consistent filters' lie)", fontsize="small")

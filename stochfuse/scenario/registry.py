@@ -252,6 +252,8 @@ QUANTITY = (
     Quantity("bias", "{stage} bias from the initial error", "what is left of a known initial error", True),
     Quantity("rms", "root-mean-square {stage} error (noise and bias)", "root of the mean squared error", True),
 )
+STATE = "state"
+"""What is asked for of a record of measurements, in the place of a quantity of the error."""
 METRIC = (
     Measure("trace", "sum of all variances"),
     Measure("det", "determinant"),
