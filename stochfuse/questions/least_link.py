@@ -35,7 +35,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from math import comb, isfinite
+from math import comb, isfinite, log
 from typing import Any, NamedTuple
 
 import mpmath
@@ -68,6 +68,8 @@ SCAN = 2049
 SECTIONS = 64
 NARROWEST = 2.0**-44
 """Width of a cell that is cut no further: two roots so close are one."""
+SPARE = 8
+"""Evaluations by which interpolation may turn out slower than halving."""
 MOST_CELLS = 4096
 """Cells that may be undecided at a time: more are rounding, where the function is as good as constant."""
 
@@ -81,12 +83,16 @@ def intervals(
     ----------
     value : the function, of many points at once.
     cells : increasing points from 0 to 1 between which the function crosses the target at most once.
-    sections : cells into which a crossing's is cut at a time; 2 where each point costs as much as the next.
+    sections : cells into which a crossing's is cut at a time; 2 where each point costs as much as the next, and the
+        function is `remembered`.
     """
     met = value(cells) <= target
     ends = [0.0] if met[0] else []
     for i in np.flatnonzero(met[1:] != met[:-1]):
-        ends.append(_narrowed(value, target, cells[i], cells[i + 1], rises=bool(met[i]), sections=sections))
+        a, b = float(cells[i]), float(cells[i + 1])
+        if sections == 2:
+            a, b = _interpolated(value, target, a, b, rises=bool(met[i]))
+        ends.append(_narrowed(value, target, a, b, rises=bool(met[i]), sections=sections))
     if met[-1]:
         ends.append(1.0)
     return tuple(zip(ends[::2], ends[1::2], strict=True))
@@ -103,6 +109,49 @@ def _narrowed(value: Function, target: float, a: float, b: float, *, rises: bool
             break
         a, b = float(points[i - 1]), float(points[i])
     return a if rises else b
+
+
+def _interpolated(value: Function, target: float, a: float, b: float, *, rises: bool) -> tuple[float, float]:
+    """The cell, narrowed as far as interpolation helps: the method ITP (Oliveira and Takahashi 2021).
+
+    Variances fall by powers of ten between µ = 0 and 1, so that their logarithms are interpolated.
+    """
+
+    def beyond(x: float) -> float:
+        y = float(value(np.array([x]))[0])
+        return log(y / target) if y > 0 and target > 0 and y != target else y - target
+
+    fa, fb = beyond(a), beyond(b)
+    whole, most = b - a, (b - a) * 2.0**SPARE
+    while b - a > NARROWEST:
+        middle, most = 0.5 * (a + b), 0.5 * most
+        x = middle
+        if isfinite(fa) and isfinite(fb) and fa != fb:
+            between = (a * fb - b * fa) / (fb - fa)
+            towards = 1.0 if middle > between else -1.0
+            bent = max(0.2 / whole * (b - a) ** 2, NARROWEST / 4)  # far enough to have the crossing between
+            x = between + towards * bent if bent <= abs(middle - between) else middle
+            slack = max(most - 0.5 * (b - a), 0.0)
+            x = x if abs(x - middle) <= slack else middle - towards * slack
+        fx = beyond(x)
+        if (fx <= 0) != rises:
+            b, fb = x, fx
+        else:
+            a, fa = x, fx
+    return a, b
+
+
+def remembered(value: Function) -> Function:
+    """Return the function with its values kept, which are asked for again and again and cost much each."""
+    known: dict[float, float] = {}
+
+    def at(link: np.ndarray) -> np.ndarray:
+        new = [µ for µ in np.unique(link).tolist() if µ not in known]
+        if new:
+            known.update(zip(new, value(np.array(new)).tolist(), strict=True))
+        return np.array([known[µ] for µ in link.tolist()])
+
+    return at
 
 
 def separated(b: np.ndarray) -> np.ndarray:
@@ -407,9 +456,9 @@ def _monotone(asked: Question) -> Expectation:
         rounding = STEADY_ROUNDING
         if len(asked.scenario.sensors) > 1:
             # where no steady state exists it takes long to find that out: one point at a time
-            value, sections = partial(_where_steady, asked, [-1.0]), 2
+            value, sections = remembered(partial(_where_steady, asked, [-1.0])), 2
     elif asked.method == OPTIMAL:
-        sections = 2
+        value, sections = remembered(value), 2
     return Expectation(value, ends, asked.predict, "monotone", rounding, sections)
 
 

@@ -36,6 +36,8 @@ from stochfuse.studies.reading import load_study, plan_of, software
 WAITING = 3
 """Chunks that are handed out for each worker: enough to keep it busy, few enough to hold little."""
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+LEFT_BEHIND = "ignore:resource_tracker:UserWarning"
+"""A killed study's semaphores are removed by Python's tracker, which need not warn of them."""
 MOST_DEADLY = 3
 """Chunks that kill their worker, after which the study stops."""
 AGAIN = "finished points are kept: the same command goes on"
@@ -151,7 +153,7 @@ def _work(
         handed = suspects[:1] if alone else list(pending)
         try:
             with _executor(executor, 1 if alone else workers) as (using, width):
-                for chunk, data in _answered(using, width, json.dumps(plan.record), handed):
+                for chunk, data in _answered(using, width, json.dumps(plan.record), handed, executor is not None):
                     journal.commit(chunk, data)
                     pending.pop(chunk)
                     progress.advance(len(plan.range_of(chunk)))
@@ -176,8 +178,10 @@ def _work(
         )
 
 
-def _answered(executor: Executor, width: int, record: str, todo: Iterable[int]) -> Iterator[tuple[int, bytes]]:
-    """Chunks with their answers as they come; no more than a few are under way."""
+def _answered(
+    executor: Executor, width: int, record: str, todo: Iterable[int], given: bool
+) -> Iterator[tuple[int, bytes]]:
+    """Chunks with their answers as they come, few under way at a time; none stays with an executor that was given."""
     waiting, chunks = {}, iter(todo)
     try:
         while True:
@@ -190,8 +194,12 @@ def _answered(executor: Executor, width: int, record: str, todo: Iterable[int]) 
             for future in sorted(finished, key=waiting.__getitem__):
                 chunk = waiting.pop(future)
                 yield chunk, _checked(future)
+    except BrokenExecutor:
+        given = False
+        raise
     finally:
-        for future in waiting:
+        # a pool whose workers are gone tells each future so, and stumbles over one that was cancelled meanwhile
+        for future in waiting if given else ():
             future.cancel()
 
 
@@ -224,8 +232,10 @@ def _executor(given: Executor | None, workers: int) -> Iterator[tuple[Executor, 
         yield given, workers if workers > 1 else getattr(given, "_max_workers", None) or os.cpu_count() or 1
         return
     # a worker has one processor: more threads in its matrix products would only be in the others' way
-    before, others = {name: os.environ.get(name) for name in THREADS}, multiprocessing.active_children()
-    os.environ.update(dict.fromkeys(THREADS, "1"))
+    warnings = ",".join(filter(None, (os.environ.get("PYTHONWARNINGS"), LEFT_BEHIND)))
+    changed: dict[str, str] = {**dict.fromkeys(THREADS, "1"), "PYTHONWARNINGS": warnings}
+    before, others = {name: os.environ.get(name) for name in changed}, multiprocessing.active_children()
+    os.environ.update(changed)
     pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"), initializer=_begin)
     try:
         yield pool, workers

@@ -379,7 +379,7 @@ MONTE_CARLO = ["predict", "--method", "monte-carlo", "--runs", "500000", "--work
 
 @pytest.mark.parametrize(
     ("work", "timer", "seconds"),
-    [*((SIMPLIFIED, "PROF", s) for s in (0.01, 0.1, 0.3, 1.0)), (GENERAL, "PROF", 1.5), (MONTE_CARLO, "REAL", 4.0)],
+    [*((SIMPLIFIED, "PROF", s) for s in (0.01, 0.1, 0.3, 1.0)), (GENERAL, "PROF", 1.5), (MONTE_CARLO, "REAL", 2.5)],
 )
 def test_ctrl_c_is_quiet(work, timer, seconds):
     """After so much processor time of the command line, imports included; where workers do the work, after so long."""
@@ -536,6 +536,20 @@ def test_derive_general():
     assert strict_json(run("derive", "naive", "--step", "1", "--format", "json").stdout)["method"] == "naive"
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("predict", "--agent"), "error: agent: expected mean, worst, best or a number from 1 to 3, got '"),
+        (("messages", "--agent"), "error: agent: expected mean or a number from 1 to 3, got '"),
+        (("predict", "--at"), "error: --at: expected steps from 1 to 5, or last, got '"),
+    ],
+)
+@pytest.mark.parametrize("number", ["²", "½", "9" * 5000, "0", "-1"])
+def test_what_looks_like_a_number_and_is_none_of_ours(words, message, number):
+    assert run(*words, number, code=2).stderr == f"{message}{number}'\n"
+
+
+@pytest.mark.slow
 def test_reproduce_timing():
     rows = strict_json(run("reproduce", "timing", "--format", "json").stdout)["rows"]
     assert [row["thesis_s"] for row in rows] == [12_000, 2, None]

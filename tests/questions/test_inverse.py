@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 import stochfuse as sf
 from stochfuse.cli.app import app
 from stochfuse.questions.agents_needed import agents_needed
-from stochfuse.questions.least_link import intervals, least_link, scanned, separated
+from stochfuse.questions.least_link import intervals, least_link, remembered, scanned, separated
 from stochfuse.questions.question import question
 from stochfuse.questions.sensitivity import sensitivity, share_of_gain
 from stochfuse.report.solutions import sensitivity_sheet
@@ -89,6 +89,23 @@ def test_a_scan_follows_dips_between_its_points():
     above = lambda x: -((x - centre) ** 2)  # noqa: E731
     found = intervals(above, scanned(above, -depth), -depth)
     np.testing.assert_allclose(found, [(0, centre - np.sqrt(depth)), (centre + np.sqrt(depth), 1)], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "f",
+    [
+        lambda x: np.exp(12 * (0.3 - x)),
+        lambda x: np.where(x < 0.25, np.inf, 1 / (np.abs(x - 0.25) + 1e-9)) - 1e8 + 1,
+        lambda x: 1 - (x - 0.7) ** 9,
+        lambda x: 2.0 - (x >= 0.123),
+    ],
+)
+def test_what_costs_much_is_asked_seldom_and_closed_in_on_as_tightly(f):
+    asked = []
+    costly = remembered(lambda x: (asked.extend(x), f(x))[1])
+    ends = np.array([0.0, 1.0])
+    np.testing.assert_allclose(intervals(costly, ends, 1.0, 2), intervals(f, ends, 1.0), rtol=0, atol=1e-15)
+    assert len(set(asked)) == len(asked) < 66  # halving alone takes 54
 
 
 # --- least link probability -----------------------------------------------------------------------------------------
@@ -538,7 +555,7 @@ def test_least_link_on_the_command_line():
     )
     assert found["certificate"]["below"]["value"] > 30 >= found["certificate"]["above"]["value"]
     assert found["met"] == [[found["link"], 1.0]]
-    value = sf.predict(sf.load_scenario(), [found["link"]], "general").values()[0, 2]
+    value = sf.predict(sf.load_scenario(steps=3), [found["link"]], "general").values()[0, 2]
     assert value == pytest.approx(30, rel=1e-12)
 
 
