@@ -19,6 +19,9 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from stochfuse.data.run import RunResult as RunResult
+    from stochfuse.data.run import run as run
+    from stochfuse.data.simulate import simulate as simulate
     from stochfuse.errors import NoAnswerError as NoAnswerError
     from stochfuse.errors import ScenarioError as ScenarioError
     from stochfuse.errors import StochfuseError as StochfuseError
@@ -28,6 +31,8 @@ if TYPE_CHECKING:
     from stochfuse.prediction.compare import Comparison as Comparison
     from stochfuse.prediction.compare import compare as compare
     from stochfuse.prediction.compare import compare_estimators as compare_estimators
+    from stochfuse.prediction.expected_states import ExpectedStates as ExpectedStates
+    from stochfuse.prediction.expected_states import expected_states as expected_states
     from stochfuse.prediction.predict import predict as predict
     from stochfuse.prediction.predict import predict_many as predict_many
     from stochfuse.prediction.result import Prediction as Prediction
@@ -66,12 +71,14 @@ _HOME = {
     "AgentsNeeded": "questions.agents_needed",
     "Comparison": "prediction.compare",
     "Critical": "questions.critical",
+    "ExpectedStates": "prediction.expected_states",
     "FusionGraph": "estimators.fusion_graph",
     "LeastLink": "questions.least_link",
     "LeastValue": "questions.least_value",
     "MessageLoad": "questions.messages",
     "NoAnswerError": "errors",
     "Prediction": "prediction.result",
+    "RunResult": "data.run",
     "Scenario": "scenario.scenario",
     "ScenarioError": "errors",
     "Sensitivity": "questions.sensitivity",
@@ -86,6 +93,7 @@ _HOME = {
     "derive_general": "symbolic.general",
     "derive_optimal": "symbolic.optimal",
     "derive_simplified": "symbolic.simplified",
+    "expected_states": "prediction.expected_states",
     "from_networkx": "scenario.adapters",
     "from_stonesoup": "scenario.adapters",
     "least_link": "questions.least_link",
@@ -98,8 +106,10 @@ _HOME = {
     "predict_many": "prediction.predict",
     "predict_states": "prediction.states",
     "read_results": "questions.results",
+    "run": "data.run",
     "sensitivity": "questions.sensitivity",
     "share_of_gain": "questions.sensitivity",
+    "simulate": "data.simulate",
     "steady_state": "prediction.steady_state",
     "study": "studies.running",
 }
@@ -108,12 +118,14 @@ __all__ = [
     "AgentsNeeded",
     "Comparison",
     "Critical",
+    "ExpectedStates",
     "FusionGraph",
     "LeastLink",
     "LeastValue",
     "MessageLoad",
     "NoAnswerError",
     "Prediction",
+    "RunResult",
     "Scenario",
     "ScenarioError",
     "Sensitivity",
@@ -129,6 +141,7 @@ __all__ = [
     "derive_general",
     "derive_optimal",
     "derive_simplified",
+    "expected_states",
     "from_networkx",
     "from_stonesoup",
     "least_link",
@@ -141,9 +154,11 @@ __all__ = [
     "predict_many",
     "predict_states",
     "read_results",
+    "run",
     "scenario",
     "sensitivity",
     "share_of_gain",
+    "simulate",
     "steady_state",
     "study",
 ]

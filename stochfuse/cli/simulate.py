@@ -56,17 +56,15 @@ def simulate(
     Sensors by name measure by their true functions, and the filters are extended ones: the realised error says how
     far the linearisation of a prediction carries.
     """
-    from stochfuse.data.run import Way
     from stochfuse.data.simulate import simulate as simulated
-    from stochfuse.kalman.metrics import metric as metric_of
 
     names = estimator_names(estimator)
     if output is not None and output.exists() and not output.is_dir():
         raise UsageError(f"--output: expected a folder, got the file {output}")
     check_files(None, plot, scenario)
     given, links = changes.of(scenario)
-    chosen = metric_of(metric or given.metric or "trace", given.model)
-    found = simulated(given, chosen, Way(names, one_link(links), seed, criterion), runs, output, force=force)
+    way = {"estimator": names, "link": one_link(links), "seed": seed, "criterion": criterion}
+    found = simulated(given, runs, metric=metric, folder=output, force=force, **way)
     show(found, format, plot, digits)
     if output is not None:
         typer.echo(

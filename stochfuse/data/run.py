@@ -14,25 +14,26 @@ is taken for steady if it is by then.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from stochfuse.data.consistency import Average, Series, band
 from stochfuse.data.draw import drawn_arrivals
-from stochfuse.data.records import Batch
+from stochfuse.data.records import Batch, read_records
 from stochfuse.engines.progress import listener
 from stochfuse.engines.replay import Arrivals, Stage, moments_given, replay
-from stochfuse.errors import StochfuseError, UsageError
+from stochfuse.errors import StochfuseError, UsageError, nearest
 from stochfuse.estimators.readings import Readings
 from stochfuse.kalman.metrics import Metric
+from stochfuse.kalman.metrics import metric as metric_of
 from stochfuse.prediction.predict import predict
 from stochfuse.scenario import registry
 from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.result import Result
-from stochfuse.scenario.scenario import Scenario, link_rows
+from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario
 
 FAR = 60
 """Steps up to which errors are predicted one by one."""
@@ -196,6 +197,75 @@ class Way:
     seed: int = 1
     criterion: str = "det"
     predicted: bool = True
+
+
+def way_of(given: Mapping[str, Any]) -> Way:
+    """Return how records are run, of what a caller gives: `estimator`, a name or several, and fields of `Way`.
+
+    Raises
+    ------
+    UsageError
+        If something has another name.
+    """
+    known = ("estimator", *(field.name for field in fields(Way) if field.name != "estimators"))
+    for name in given:
+        if name not in known:
+            raise UsageError(f"{name}: no such setting{nearest(name, known)}; expected {', '.join(known)}")
+    rest, asked = dict(given), given.get("estimator", (registry.LFG,))
+    rest.pop("estimator", None)
+    names = (asked,) if isinstance(asked, str) else tuple(asked)
+    for name in names:
+        if name not in registry.ESTIMATORS:
+            listed = ", ".join(registry.ESTIMATORS)
+            raise UsageError(f"estimator: expected one of {listed}, got '{name}'{nearest(name, registry.ESTIMATORS)}")
+    return Way(names, **rest)
+
+
+@of_scenario
+def run(
+    scenario: Scenario,
+    measurements: Any,
+    arrivals: Any = None,
+    truth: Any = None,
+    *,
+    initial: Any = None,
+    columns: Mapping[str, str] | None = None,
+    metric: str | None = None,
+    **way: Any,
+) -> RunResult:
+    """Run estimators on measurements, beside what is predicted.
+
+    Parameters
+    ----------
+    scenario : what the estimators are told; it is lengthened to the records' last step.
+    measurements, arrivals, truth, initial : files, mappings of arrays or data frames, see `stochfuse.data.records`;
+        arrivals that are not given are drawn from the links.
+    columns : names that they have for columns, by the names here.
+    metric : what errors are shown in; default: the scenario's, else trace.
+    **way : estimator (a name or several), link, seed, criterion, predicted (False: predict nothing), see `Way`.
+
+    Returns
+    -------
+    RunResult
+        `to_dataframe()` has a row for every estimator and agent.
+
+    Raises
+    ------
+    UsageError
+        If a file is malformed, or an estimator or the links do not fit.
+
+    Examples
+    --------
+    >>> import stochfuse as sf
+    >>> z = {"step": [2, 2, 3, 3], "agent": [1, 2, 1, 2], "z1": [0.3, -0.2, 1.1, 0.7]}
+    >>> heard = {"step": [2], "receiver": [1], "sender": [2]}
+    >>> found = sf.run(sf.load_scenario("thesis-steady", agents=2, steps=3), z, heard, estimator="naive")
+    >>> found.rows[0].estimator, found.rows[0].agent, found.rows[0].realised
+    ('naive', None, None)
+    """
+    how = way_of(way)
+    records = read_records(scenario, measurements, arrivals, truth, initial, columns)
+    return run_records(records, metric_of(metric or scenario.metric or "trace", scenario.model), how)
 
 
 def run_records(

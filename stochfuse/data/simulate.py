@@ -11,17 +11,18 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from stochfuse.data.draw import drawn, drawn_arrivals
 from stochfuse.data.records import NUMBERS, Batch
-from stochfuse.data.run import RunResult, Way, run_records
+from stochfuse.data.run import RunResult, run_records, way_of
 from stochfuse.data.writing import ARRIVALS, ESTIMATES, FIRST, MEASUREMENTS, TRUTH, EstimatesFile, RecordFiles
 from stochfuse.errors import UsageError
-from stochfuse.kalman.metrics import Metric
+from stochfuse.kalman.metrics import metric as metric_of
 from stochfuse.scenario.network import LinkRows
-from stochfuse.scenario.scenario import Scenario, link_rows
+from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario
 
 FILES = (MEASUREMENTS, ARRIVALS, TRUTH, FIRST, ESTIMATES)
 DEPARTS = 1e-6
@@ -97,43 +98,59 @@ class Draws:
             yield batch
 
 
+@of_scenario
 def simulate(
     scenario: Scenario,
-    metric: Metric,
-    way: Way,
     runs: int = 1,
-    folder: Path | None = None,
     *,
+    metric: str | None = None,
+    folder: str | Path | None = None,
     force: bool = False,
+    **way: Any,
 ) -> RunResult:
-    """Simulate runs of a scenario.
+    """Simulate runs of a scenario, and run estimators on them, beside what is predicted.
 
     Parameters
     ----------
-    metric : what errors are shown in.
-    way : estimators, link probability, and the seed of everything.
     runs : how many.
+    metric : what errors are shown in; default: the scenario's, else trace.
     folder : where truth, measurements, arrivals, first estimates and estimates are written; made if need be.
     force : whether files that are there may be replaced.
+    **way : estimator (a name or several), link, seed (of everything), criterion, predicted, see
+        `stochfuse.data.run.Way`.
+
+    Returns
+    -------
+    RunResult
 
     Raises
     ------
     UsageError
         If the scenario has no one link probability, or the folder has such files already.
+
+    Examples
+    --------
+    >>> import stochfuse as sf
+    >>> found = sf.simulate(sf.load_scenario("thesis-steady", agents=2, steps=3), 50, link=0.5, estimator="optimal")
+    >>> found.rows[0].verdict
+    'consistent'
     """
+    how = way_of(way)
     if runs < 1:
         raise UsageError(f"runs: expected at least 1, got {runs}")
-    links = link_rows(scenario, None if way.link is None else [way.link])
+    links = link_rows(scenario, None if how.link is None else [how.link])
     if len(links.link) != 1:
         raise UsageError(f"link: expected one link probability to simulate, got {len(links.link)}; give --link")
-    draws = Draws(scenario, tuple(str(i + 1) for i in range(runs)), links, way.seed)
+    shown = metric_of(metric or scenario.metric or "trace", scenario.model)
+    draws = Draws(scenario, tuple(str(i + 1) for i in range(runs)), links, how.seed)
     if folder is None:
-        return replace(run_records(draws, metric, way), simulated=True)
-    _check_folder(folder, force)
+        return replace(run_records(draws, shown, how), simulated=True)
+    where = Path(folder)
+    _check_folder(where, force)
     with ExitStack() as stack:
-        files = stack.enter_context(RecordFiles(folder, scenario))
-        estimates = stack.enter_context(EstimatesFile(folder / ESTIMATES, scenario, truth=True))
-        return replace(run_records(replace(draws, files=files), metric, way, estimates.write), simulated=True)
+        files = stack.enter_context(RecordFiles(where, scenario))
+        estimates = stack.enter_context(EstimatesFile(where / ESTIMATES, scenario, truth=True))
+        return replace(run_records(replace(draws, files=files), shown, how, estimates.write), simulated=True)
 
 
 def _check_folder(folder: Path, force: bool) -> None:
