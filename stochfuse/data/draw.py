@@ -23,6 +23,7 @@ from stochfuse.data.records import arrivals_of
 from stochfuse.engines.events import events
 from stochfuse.engines.monte_carlo import draw_fates
 from stochfuse.engines.replay import Arrivals
+from stochfuse.errors import UsageError
 from stochfuse.estimators.protocol import Late
 from stochfuse.estimators.readings import Function, Readings
 from stochfuse.estimators.world import World
@@ -79,7 +80,7 @@ def drawn_arrivals(system: System, links: LinkRows, missed: np.ndarray, seed: in
                     rows = np.full((len(came), 4), (0, step, receiver, event.sender))
                     rows[:, 0] = place.start + came
                     heard.append(rows)
-                for run in np.flatnonzero(fate > 1).tolist():
+                for run in np.flatnonzero((fate > 1) & (step + fate - 1 < steps)).tolist():
                     messages = late.setdefault((place.start + run, step + 1), [])
                     messages += [Late(receiver, int(fate[run]) - 1, event.sender) for receiver in event.receivers]
     rows = np.concatenate(heard) if heard else np.zeros((0, 4), dtype=np.int64)
@@ -123,6 +124,8 @@ def drawn(
     for _, number, generator in _blocks(seed, NOISES, first, runs):
         parts.append(_Block(system, functions, start, generator).drawn(number))
     truth, z, relations, begun = zip(*parts, strict=True)
+    if system.filters and not system.own:
+        _check_one_truth(np.concatenate(truth))
     measured = tuple(np.concatenate(each) for each in zip(*z, strict=True))
     for agent, each in enumerate(measured):
         each[missed[:, :, agent]] = np.nan
@@ -137,6 +140,17 @@ def drawn(
         missed,
         tuple(np.concatenate(each) for each in zip(*begun, strict=True)),
     )
+
+
+def _check_one_truth(truth: np.ndarray) -> None:
+    """Raise UsageError unless the states of parallel filters, as they are shaped, are one state."""
+    apart = np.abs(truth - truth[:, :, :1]).max()
+    if apart > 1e-9 * np.abs(truth).max():
+        raise UsageError(
+            "simulate: expected filters that follow one true state, got parallel filters whose process noises "
+            "([[agent]] Q, noise.process) move their states apart; what is predicted of them are errors, each about its "
+            "own state"
+        )
 
 
 class _Block:

@@ -26,7 +26,7 @@ import numpy as np
 
 from stochfuse.data.columns import TEXT, WHOLE, Columns, ColumnsError, Field, Labels, read_columns
 from stochfuse.engines.replay import Arrivals
-from stochfuse.errors import UsageError, nearest
+from stochfuse.errors import StochfuseError, UsageError, nearest
 from stochfuse.estimators.protocol import Late
 from stochfuse.scenario.network import reachable
 from stochfuse.scenario.scenario import Scenario, load_scenario
@@ -307,7 +307,7 @@ def _lengthened(scenario: Scenario, last: int, tables: Mapping[str, _Given]) -> 
     source = scenario.to_mapping()
     try:
         return load_scenario({**source, "network": {**source["network"], "steps": last}})
-    except UsageError as error:
+    except StochfuseError as error:
         table = max(tables.values(), key=lambda table: table.last)
         row = int(table.where[:, 0].argmax())
         raise ColumnsError(
@@ -438,7 +438,6 @@ class _Reader:
             )
         self._check_width(found, values, expected, z)
         step = found.number["step"].astype(np.int64) - 1
-        there = ~np.isnan(values[:, 0]) & (step > 0)
         early = int((~np.isnan(values[:, 0]) & (step == 0)).sum())
         where = np.stack([step, agent, of], axis=1)
         notes = []
@@ -446,7 +445,7 @@ class _Reader:
             notes.append(f"{found.source}: {early} measurements of step 1 are not used: estimates begin there")
         if values.shape[1] < most:
             values = np.concatenate([values, np.full((len(values), most - values.shape[1]), np.nan)], axis=1)
-        return self._once(found, where, values, notes, there | (step == 0))
+        return self._once(found, where, values, notes, step > 0)
 
     def arrivals(self, source: Any) -> _Given:
         """Messages: keys step, receiver, sender, step of sending."""

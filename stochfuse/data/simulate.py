@@ -161,5 +161,5 @@ def _check_folder(folder: Path, force: bool) -> None:
     there = [name for name in FILES if (folder / name).exists()]
     if there and not force:
         raise UsageError(
-            f"{folder}: expected a folder without {', '.join(there)}, which would be replaced; see --force"
+            f"{folder}: expected a folder without {', '.join(there)}, as they would be replaced; force replaces them"
         )
