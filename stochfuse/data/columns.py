@@ -58,7 +58,7 @@ class Field(NamedTuple):
     least : smallest number that is allowed.
     required : whether the column must be there.
     blank : whether cells may be empty.
-    free : whether not-a-number and infinity are values like others.
+    free : whether not-a-number, infinity and what is less than `least` are values like others, for the reader to judge.
     """
 
     name: str
@@ -367,8 +367,7 @@ def _checked(
             text[field.name] = labels
             continue
         values, empty, wrong = found if isinstance(found, _Numbers) else _numbers(found)
-        bad = np.zeros(len(values), dtype=bool) if field.free else ~np.isfinite(values)
-        bad |= values < field.least
+        bad = np.zeros(len(values), dtype=bool) if field.free else ~np.isfinite(values) | (values < field.least)
         if field.kind == WHOLE:
             bad |= values != np.round(values)
         bad[empty] = not field.blank
@@ -431,11 +430,16 @@ def _numbers(cells: Sequence[Any] | np.ndarray) -> _Numbers:
 
 
 def _labelled(cells: Any) -> Labels:
-    """Cells of any kind as texts."""
-    texts = ["" if _empty(cell) or cell != cell else str(_plain(cell)).strip() for cell in cells]
+    """Cells of any kind as texts; only the different ones are looked at."""
+    seen: dict[Any, int] = {}
+    try:
+        places = [seen.setdefault(cell, len(seen)) for cell in (cells.tolist() if hasattr(cells, "tolist") else cells)]
+    except TypeError:  # lists and the like, which are no texts anyway
+        return _labelled([str(cell) for cell in cells])
+    texts = ["" if _empty(cell) or cell != cell else str(cell).strip() for cell in seen]
     names = tuple(name for name in dict.fromkeys(texts) if name)
     index = {name: i for i, name in enumerate(names)} | {"": -1}
-    return Labels(np.fromiter(map(index.__getitem__, texts), dtype=np.int32, count=len(texts)), names)
+    return Labels(np.array([index[text] for text in texts], dtype=np.int32)[places], names)
 
 
 def _global(labels: Labels, known: dict[str, int]) -> Labels:
