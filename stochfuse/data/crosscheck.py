@@ -35,7 +35,7 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc, stdtr
 
 from stochfuse.data.columns import Labels
-from stochfuse.data.expected import Expectations, Expected, Family, averages_suffice, families_of
+from stochfuse.data.expected import Expectations, Expected, Family, families_of, knows
 from stochfuse.data.results import Observed, ResultsError, SimulatorResults, dense, read_results
 from stochfuse.errors import StochfuseError, UsageError, nearest
 from stochfuse.kalman.metrics import Metric
@@ -210,21 +210,18 @@ def crosscheck(
     read = replace(read, observed=tuple(o for o in read.observed if o.column not in unknown))
     said += [f"column {name} is not compared: {why}" for name, why in unknown.items()]
     again = None
-    if any(o.kind == "nees" for o in read.observed) and _only_averages(prediction):
+    unsaid = [f for f in _families(read, prediction, chosen)[0] if not knows(prediction, f)]
+    if unsaid:
         whose = prediction.estimator if prediction.estimator in ESTIMATORS else estimator or given.estimator or LFG
         asked = {name: settings[name] for name in ("runs", "seed", "workers", "criterion") if name in settings}
         again = predict(given, rows, MONTE_CARLO, "actual", estimator=whose, **asked)
+        what = " and ".join(dict.fromkeys("NEES" if f.quantity == "nees" else f.metric for f in unsaid))
         said.append(
-            f"method {prediction.method} knows averages only: the expected NEES is sampled, {again.meta['runs']} runs "
-            f"of estimator {whose}"
+            f"method {prediction.method} knows averages only: the {what} expected is sampled, {again.meta['runs']} "
+            f"runs of estimator {whose}"
         )
     verdict = check_results(read, prediction, chosen, alpha, again)
     return replace(verdict, notes=(*said, *verdict.notes))
-
-
-def _only_averages(prediction: Prediction) -> bool:
-    listed = prediction.outcomes is not None or prediction.sampled is not None
-    return not listed and not averages_suffice(prediction)
 
 
 def _predicted(
@@ -317,18 +314,16 @@ def check_results(
         raise UsageError(f"alpha: expected a probability between 0 and 1, got {alpha:g}")
     who = _agents(results, prediction)
     families, notes = _families(results, prediction, metric)
-    told = [not (f.quantity == "nees" and _only_averages(prediction)) for f in families]
-    parts = [(prediction, [f for f, knows in zip(families, told, strict=True) if knows])]
-    if not all(told):
-        if sampled is None:
-            raise UsageError(
-                f"column 'nees': expected a method that lists outcomes, or a sampled prediction besides, got method "
-                f"{prediction.method}"
-            )
-        parts.append((sampled, [f for f, knows in zip(families, told, strict=True) if not knows]))
+    known = [f for f in families if sampled is None or knows(prediction, f)]
+    others = [f for f in families if sampled is not None and not knows(prediction, f)]
+    if sampled is None and any(f.quantity == "nees" and not knows(prediction, f) for f in families):
+        raise UsageError(
+            f"column 'nees': expected a method that lists outcomes, or a sampled prediction besides, got method "
+            f"{prediction.method}"
+        )
     raw: list[Judged] = []
-    for against, some in parts:
-        if some:
+    for against, some in ((prediction, known), (sampled, others)):
+        if against is not None and some:
             raw += (_of_means if results.run is None else _of_runs)(results, who, against, some)
     if not raw and not results.evidence:
         raise ResultsError(f"{results.source}: nothing to compare: every value is empty")
@@ -391,11 +386,6 @@ def _families(results: SimulatorResults, prediction: Prediction, metric: Metric)
             continue
         sense = _sense(results, observed, prediction, metric)
         families += families_of(observed, sense, means=results.run is None)
-        if observed.kind == "covariance" and not sense.linear and _only_averages(prediction):
-            notes.append(
-                f"column {observed.column}: method {prediction.method} knows averages only, the {sense.name} expected "
-                "is that of the average covariance"
-            )
     return families, notes
 
 

@@ -127,7 +127,7 @@ class Expected(NamedTuple):
             return 0.0
         runs = self.drawn.shape[1]
         error = float(self.drawn[row].std(ddof=1)) / np.sqrt(runs)
-        return error if error > FLAT * abs(float(self.mean[row])) else 0.0
+        return float(error) if error > FLAT * abs(float(self.mean[row])) else 0.0
 
 
 class Family(NamedTuple):
@@ -142,6 +142,7 @@ class Family(NamedTuple):
     std : (rows,) of means, or None.
     resolution : what rounding in the file may do to a mean.
     parts : what a value is in every outcome.
+    linear : whether its mean follows from average moments.
     """
 
     column: str
@@ -151,6 +152,7 @@ class Family(NamedTuple):
     std: np.ndarray | None
     resolution: float
     parts: Callable[[Moments], Parts]
+    linear: bool = True
 
     @property
     def noisy(self) -> bool:
@@ -238,9 +240,15 @@ class Expectations:
         )
 
 
-def averages_suffice(prediction: Prediction) -> bool:
-    """Whether the expected NEES follows from average moments: where in every outcome the claim is true."""
-    return prediction.method == OPTIMAL and prediction.moments.bias is not None and not prediction.moments.bias.any()
+def knows(prediction: Prediction, family: Family) -> bool:
+    """Whether a prediction knows the mean of what is compared: listed or sampled outcomes, or averages that suffice."""
+    if prediction.outcomes is not None or prediction.sampled is not None:
+        return True
+    if family.quantity == "nees":
+        # where in every outcome the claim is true the NEES is the number of states
+        bias = prediction.moments.bias
+        return prediction.method == OPTIMAL and bias is not None and not bias.any()
+    return family.linear
 
 
 def _of_outcomes(probability: np.ndarray, parts: Parts) -> Expected:
@@ -301,7 +309,8 @@ def families_of(observed: Observed, metric: Metric, *, means: bool) -> list[Fami
     column, values, std, resolution = observed
     make = partial(Family, column)
     if observed.kind == "covariance":
-        return [make("claimed", metric.name, values, std, resolution, partial(claimed_parts, metric))]
+        of = partial(claimed_parts, metric)
+        return [make("claimed", metric.name, values, std, resolution, of, metric.linear)]
     if observed.kind == "nees":
         return [make("nees", "nees", values, std, resolution, nees_parts)]
     squares = partial(square_parts, metric.states)

@@ -272,7 +272,7 @@ def _draw_scores(axes: Any, shown: CrosscheckView, looks: dict[str, dict[str, An
     for sign in (1, -1):
         axes.axhline(sign * limit, color="0.2", linewidth=0.8, linestyle="--")
     axes.set_ylim(-reach, reach)
-    axes.set_ylabel("z")
+    axes.set_ylabel("z, in standard errors", fontsize="small")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.3)
     said = [f"dashed: |z| = {limit:.2f}, reached by one of {counted(len(v.cells), 'cell')} with probability {level:g}"]

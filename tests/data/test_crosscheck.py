@@ -6,10 +6,10 @@ import json
 
 import numpy as np
 import pytest
-from stochfuse.data.crosscheck import check_results
-from stochfuse.data.results import ResultsError, read_results
 
 import stochfuse as sf
+from stochfuse.data.crosscheck import check_results
+from stochfuse.data.results import ResultsError, read_results
 from stochfuse.kalman.metrics import metric
 
 LINKS = ["0", "0.25", "0.5", "0.75", "1"]
