@@ -52,6 +52,10 @@ NORMAL, ENOUGH_RUNS, SKEWED = 0.3, 200, 0.1
 """Largest correction of the normal tail for skewness with which it is used; least runs, largest skewness for T²."""
 ROUNDING = 1e-9
 """Relative difference that is rounding, besides that of the digits in the file."""
+WITH_ERROR = (
+    "the scenario has a known initial error (initial.error): errors, squared errors and NEES are expected with what is "
+    "left of it; leave it out of the scenario if the simulator starts without"
+)
 MOST_TOGETHER = 1500
 """Cells of a link whose correlations are worked out; of more, as many spread over all of them."""
 
@@ -386,6 +390,9 @@ def _families(results: SimulatorResults, prediction: Prediction, metric: Metric)
             continue
         sense = _sense(results, observed, prediction, metric)
         families += families_of(observed, sense, means=results.run is None)
+    bias = prediction.moments.bias
+    if any(family.noisy for family in families) and bias is not None and bias.any():
+        notes.append(WITH_ERROR)
     return families, notes
 
 
@@ -428,12 +435,28 @@ class Judged(NamedTuple):
     skewness : of the mean.
     runs : (runs of the link,) average over the agents in every run, not-a-number where there is none; None of means.
     drawn : what is expected in every run of a sample, or None.
+    beyond : mean less expected, less what the digits of the file leave open.
+    given : what they leave open.
     """
 
     cell: Cell
     skewness: float | None = None
     runs: np.ndarray | None = None
     drawn: np.ndarray | None = None
+    beyond: float = 0.0
+    given: float = 0.0
+
+    @property
+    def own_error(self) -> float:
+        """Standard error of the simulator's mean by its own runs, whatever is known of the law."""
+        if self.runs is None:
+            return self.cell.error
+        return float(np.nanstd(self.runs, ddof=1)) / sqrt(self.cell.runs)
+
+    @property
+    def total_error(self) -> float:
+        """The same with that of what is expected."""
+        return float(np.hypot(self.own_error, self.cell.expected_error))
 
 
 class _Gathered(NamedTuple):
@@ -587,7 +610,7 @@ def _judged(cell: Cell, family: Family, expected: Expected, share: float) -> Jud
             p = max(p, expected.law(row).tail(wanted + float(np.copysign(shift, beyond)), runs))
     done = cell._replace(expected=wanted, error=own, z=z, p=p, expected_error=other)
     drawn = None if expected.drawn is None else expected.drawn[row]
-    return Judged(done, skewness if known else None, None, drawn)
+    return Judged(done, skewness if known else None, None, drawn, beyond, given)
 
 
 def _blocks(judged: Sequence[Judged]) -> tuple[Block, ...]:
@@ -605,7 +628,7 @@ def _correlation(judged: Sequence[Judged]) -> np.ndarray:
     """Correlations of mean less expected, of the runs and samples that cells share."""
     total = np.zeros((len(judged), len(judged)))
     for rows, errors in (
-        ([j.runs for j in judged], [j.cell.error for j in judged]),
+        ([j.runs for j in judged], [j.own_error for j in judged]),
         ([j.drawn for j in judged], [j.cell.expected_error for j in judged]),
     ):
         for shape in {row.shape for row in rows if row is not None}:
@@ -633,14 +656,17 @@ def _together(judged: Sequence[Judged], blocks: Sequence[Block]) -> float | None
         if not fit:
             continue
         some = [judged[block.cells[place]] for place in fit]
-        z = np.array([j.cell.z for j in some])
+        # by the runs alone: what hangs together exactly, like a squared error and its parts, must do so in z as well
+        errors = np.array([j.total_error for j in some])
+        z = np.array([j.beyond for j in some]) / errors
         values, vectors = np.linalg.eigh(block.correlation[np.ix_(fit, fit)])
-        # directions that hardly vary are rounding
-        firm = values > 1e-6
+        # directions that hardly vary are rounding, in the file or in here
+        blur = max(j.given / error for j, error in zip(some, errors, strict=True))
+        firm = values > max(1e-6, (5.0 * blur) ** 2)
         components = (vectors.T @ z)[firm] / np.sqrt(values[firm])
         n = min(min(j.cell.runs, j.cell.runs if j.drawn is None else len(j.drawn)) for j in some)
         d = int(firm.sum())
-        if n - d >= ENOUGH_RUNS / 2:
+        if d and n - d >= ENOUGH_RUNS / 2:
             by_link.append(float(fdtrc(d, n - d, float((components**2).sum()) * (n - d) / (d * (n - 1)))))
     if not by_link:
         return None
