@@ -34,6 +34,8 @@ CHAPTERS = {
     "Models by name": "scenario.motion",
     "Sensors by name": "scenario.sensing",
     "What rounding can do": "engines.precision",
+    "What a simulator's values are distributed like": "data.expected",
+    "Whether a simulator is right": "data.crosscheck",
 }
 
 

@@ -435,28 +435,25 @@ class Judged(NamedTuple):
     skewness : of the mean.
     runs : (runs of the link,) average over the agents in every run, not-a-number where there is none; None of means.
     drawn : what is expected in every run of a sample, or None.
-    beyond : mean less expected, less what the digits of the file leave open.
-    given : what they leave open.
+    given : what the digits of the file leave open of the mean.
     """
 
     cell: Cell
     skewness: float | None = None
     runs: np.ndarray | None = None
     drawn: np.ndarray | None = None
-    beyond: float = 0.0
     given: float = 0.0
 
     @property
-    def own_error(self) -> float:
-        """Standard error of the simulator's mean by its own runs, whatever is known of the law."""
-        if self.runs is None:
-            return self.cell.error
-        return float(np.nanstd(self.runs, ddof=1)) / sqrt(self.cell.runs)
+    def total_error(self) -> float:
+        """Standard error of the difference."""
+        return float(np.hypot(self.cell.error, self.cell.expected_error))
 
     @property
-    def total_error(self) -> float:
-        """The same with that of what is expected."""
-        return float(np.hypot(self.own_error, self.cell.expected_error))
+    def misfit(self) -> float:
+        """By how much the sample's own standard error differs from the one that is used, relatively."""
+        own = float(np.nanstd(self.runs, ddof=1)) / sqrt(self.cell.runs) if self.runs is not None else 0.0
+        return abs(own / self.cell.error - 1.0)
 
 
 class _Gathered(NamedTuple):
@@ -610,7 +607,7 @@ def _judged(cell: Cell, family: Family, expected: Expected, share: float) -> Jud
             p = max(p, expected.law(row).tail(wanted + float(np.copysign(shift, beyond)), runs))
     done = cell._replace(expected=wanted, error=own, z=z, p=p, expected_error=other)
     drawn = None if expected.drawn is None else expected.drawn[row]
-    return Judged(done, skewness if known else None, None, drawn, beyond, given)
+    return Judged(done, skewness if known else None, None, drawn, given)
 
 
 def _blocks(judged: Sequence[Judged]) -> tuple[Block, ...]:
@@ -628,7 +625,7 @@ def _correlation(judged: Sequence[Judged]) -> np.ndarray:
     """Correlations of mean less expected, of the runs and samples that cells share."""
     total = np.zeros((len(judged), len(judged)))
     for rows, errors in (
-        ([j.runs for j in judged], [j.own_error for j in judged]),
+        ([j.runs for j in judged], [j.cell.error for j in judged]),
         ([j.drawn for j in judged], [j.cell.expected_error for j in judged]),
     ):
         for shape in {row.shape for row in rows if row is not None}:
@@ -656,13 +653,13 @@ def _together(judged: Sequence[Judged], blocks: Sequence[Block]) -> float | None
         if not fit:
             continue
         some = [judged[block.cells[place]] for place in fit]
-        # by the runs alone: what hangs together exactly, like a squared error and its parts, must do so in z as well
-        errors = np.array([j.total_error for j in some])
-        z = np.array([j.beyond for j in some]) / errors
+        z = np.array([j.cell.z for j in some])
         values, vectors = np.linalg.eigh(block.correlation[np.ix_(fit, fit)])
-        # directions that hardly vary are rounding, in the file or in here
-        blur = max(j.given / error for j, error in zip(some, errors, strict=True))
-        firm = values > max(1e-6, (5.0 * blur) ** 2)
+        # in directions that hardly vary (a squared error is the sum of its parts) nothing is seen but rounding, in the
+        # file or in here, and by how much deviations that are known differ from the sample's, with its correlations
+        blur = max(j.given / j.total_error for j in some)
+        misfit = max(j.misfit for j in some)
+        firm = values > max(1e-6, (5.0 * blur) ** 2, (3.0 * misfit) ** 2 * values.max())
         components = (vectors.T @ z)[firm] / np.sqrt(values[firm])
         n = min(min(j.cell.runs, j.cell.runs if j.drawn is None else len(j.drawn)) for j in some)
         d = int(firm.sum())

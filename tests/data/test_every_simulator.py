@@ -382,8 +382,8 @@ def test_quantities_stand_in_every_form(honest, tmp_path):
     shown = command(*words, env={"COLUMNS": "100"}).stdout
     assert "against: Expected claimed posterior covariance: trace over x, v" in shown
     assert "against: Expected NEES" in shown
-    assert " claimed trace   0.3   1   1-2 " in shown
-    assert " nees            0.3   1   1-2 " in shown
+    assert " claimed   0.3   1   1-2 " in shown
+    assert " nees      0.3   1   1-2 " in shown
     lines = command(*words, "--format", "csv").stdout.splitlines()
     assert lines[0] == "link,step,agents,runs,mean,standard_error,expected,z,p_corrected,verdict,quantity,metric,column,expected_standard_error"  # fmt: skip
     assert lines[-1].split(",")[10:] == ["nees", "nees", "nees", "0.0"]
