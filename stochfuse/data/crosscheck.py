@@ -18,7 +18,8 @@ Two tests share the level α, Bonferroni's way:
 
     the smallest p, corrected for the number of cells (finds an error anywhere)
     all cells together: Hotelling's T² over the cells of a link, over links by Fisher's method (finds a small error
-    everywhere); only of cells with enough runs for it, and not where only means are given
+    everywhere), or Bonferroni's where one seed for all links makes them alike; only of cells with enough runs for it,
+    and not where only means are given
 
 The simulator disagrees if either does, or if it says what cannot be (a negative covariance).  Digits that the file does
 not give are never held against it.
@@ -28,6 +29,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from math import erfc, sqrt
 from typing import Any, NamedTuple
 
@@ -52,6 +54,10 @@ NORMAL, ENOUGH_RUNS, SKEWED = 0.3, 200, 0.1
 """Largest correction of the normal tail for skewness with which it is used; least runs, largest skewness for T²."""
 ROUNDING = 1e-9
 """Relative difference that is rounding, besides that of the digits in the file."""
+SPARSE = 16
+"""Places for values per value up to which runs are laid beside each other."""
+ALIKE = 4.5
+"""Correlation of two links' runs, in standard errors, from which on they are not taken for independent."""
 WITH_ERROR = (
     "the scenario has a known initial error (initial.error): errors, squared errors and NEES are expected with what is "
     "left of it; leave it out of the scenario if the simulator starts without"
@@ -474,16 +480,18 @@ class _Gathered(NamedTuple):
 
 
 def _gathered(
-    results: SimulatorResults, row: int, who: np.ndarray | None, prediction: Prediction, families: Sequence[Family]
+    results: SimulatorResults, here: Any, who: np.ndarray | None, prediction: Prediction, families: Sequence[Family]
 ) -> _Gathered:
+    """Values of some rows, those of one link."""
     groups, steps, agents = prediction.by_group.shape[2], len(prediction.steps), len(prediction.group_of)
-    here: Any = slice(None) if len(results.links) == 1 else np.flatnonzero(results.link.codes == row)
     cell, seen = results.step[here] - 1, np.zeros((groups * steps, agents), dtype=bool)
     if who is not None:
         agent = who[here] - 1
         cell = cell + prediction.group_of[agent] * steps
         seen = np.bincount(cell * agents + agent, minlength=seen.size).reshape(seen.shape) > 0
     run = dense(_runs(results)[here])
+    if groups * steps * (int(run.max()) + 1) > SPARSE * len(run) + 1_000_000:
+        run = _within(cell, run)
     width = int(run.max()) + 1
     key, size = cell * width + run, groups * steps * width
     averages, single, number = [], [], []
@@ -502,6 +510,27 @@ def _gathered(
     return _Gathered(averages, single, number, seen.reshape(groups, steps, agents))
 
 
+def _within(cell: np.ndarray, run: np.ndarray) -> np.ndarray:
+    """Numbers of runs within each cell: where hardly a run has more than one cell there is nothing to hang together."""
+    order = np.lexsort((run, cell))
+    c, r = cell[order], run[order]
+    new = np.concatenate([[True], (c[1:] != c[:-1]) | (r[1:] != r[:-1])])
+    number = np.cumsum(new) - 1
+    first = np.concatenate([[True], c[1:] != c[:-1]])
+    out = np.empty(len(run), dtype=np.int64)
+    out[order] = number - number[first][np.cumsum(first) - 1]
+    return out
+
+
+def _rows_by_link(results: SimulatorResults) -> list[Any]:
+    """Rows of every link."""
+    links = len(results.links)
+    if links == 1:
+        return [slice(None)]
+    order = np.argsort(results.link.codes, kind="stable")
+    return np.split(order, np.searchsorted(results.link.codes[order], np.arange(1, links)))
+
+
 def _runs(results: SimulatorResults) -> np.ndarray:
     return results.run if results.run is not None else np.zeros(0, dtype=np.int64)
 
@@ -513,7 +542,7 @@ def _members(prediction: Prediction, group: int) -> tuple[int, ...]:
 def _of_runs(
     results: SimulatorResults, who: np.ndarray | None, prediction: Prediction, families: Sequence[Family]
 ) -> list[Judged]:
-    found = [_gathered(results, row, who, prediction, families) for row in range(len(results.links))]
+    found = [_gathered(results, here, who, prediction, families) for here in _rows_by_link(results)]
     expectations, judged = Expectations(prediction, families), []
     for group, step in np.ndindex(*found[0].number[0].shape):
         if not any(each[group, step] for link in found for each in link.number):
@@ -646,7 +675,7 @@ def _correlation(judged: Sequence[Judged]) -> np.ndarray:
 
 
 def _together(judged: Sequence[Judged], blocks: Sequence[Block]) -> float | None:
-    """Hotelling's T² of every link's cells, over links by Fisher's method; None if there are too few runs for it."""
+    """Hotelling's T² of every link's cells, then over links; None if there are too few runs for it."""
     by_link = []
     for block in blocks:
         fit = [place for place, i in enumerate(block.cells) if _fit(judged[i])]
@@ -667,7 +696,28 @@ def _together(judged: Sequence[Judged], blocks: Sequence[Block]) -> float | None
             by_link.append(float(fdtrc(d, n - d, float((components**2).sum()) * (n - d) / (d * (n - 1)))))
     if not by_link:
         return None
+    if _drawn_alike(judged, blocks):
+        return min(1.0, len(by_link) * min(by_link))
     return float(chdtrc(2 * len(by_link), -2.0 * float(np.log(np.maximum(by_link, 1e-300)).sum())))
+
+
+def _drawn_alike(judged: Sequence[Judged], blocks: Sequence[Block]) -> bool:
+    """Whether runs of one number are drawn alike for several links, by one seed for all: links that tell the same."""
+    found = []
+    for block in blocks:
+        cells = [judged[i] for i in block.cells]
+        found.append({(j.cell.column, j.cell.quantity, j.cell.agents, j.cell.step): j.runs for j in cells})
+    for one, other in pairwise(found):
+        for key, x in one.items():
+            y = other.get(key)
+            if x is None or y is None or x.shape != y.shape:
+                continue
+            both = ~np.isnan(x + y)
+            x, y = x[both] - x[both].mean(), y[both] - y[both].mean()
+            length = float(np.sqrt((x @ x) * (y @ y)))
+            if length > 0 and abs(float(x @ y)) / length * sqrt(len(x)) > ALIKE:
+                return True
+    return False
 
 
 def _fit(judged: Judged) -> bool:

@@ -9,6 +9,7 @@ import pytest
 from scipy.stats import binom, chi2, norm
 
 import stochfuse as sf
+from stochfuse.data import crosscheck
 from stochfuse.data.expected import Law, Parts
 from stochfuse.data.results import ResultsError, read_results
 from stochfuse.kalman.metrics import metric
@@ -173,6 +174,28 @@ def test_blocks_where_some_runs_are_missing(honest, prediction):
     )
     whole = np.corrcoef(first[500:1000], second[500:1000])[0, 1]
     assert block.correlation[0, 1] == pytest.approx(whole / 2, abs=0.05)
+
+
+def test_runs_that_have_one_step_each(honest, prediction):
+    """Runs numbered on from step to step: as many places as rows are taken, and the same is found."""
+    apart = some(honest, "covariance", "nees", rows=honest["run"] < 200)
+    found = checked(apart, prediction)
+    apart["run"] = apart["run"] + 1_000_000 * apart["step"] * np.where(apart["link"] < 0.5, 1, 9)
+    lonely = checked(apart, prediction)
+    for a, b in zip(found.cells, lonely.cells, strict=True):
+        assert (a.runs, a.mean, a.z) == (b.runs, pytest.approx(b.mean), pytest.approx(b.z, abs=1e-6))
+    within = crosscheck._within(np.array([1, 0, 1, 1, 0]), np.array([5, 7, 9, 5, 8]))
+    assert within.tolist() == [0, 0, 1, 0, 1]
+
+
+def test_links_drawn_with_one_seed_are_not_independent(honest):
+    """What a link shows is not shown again by its copy."""
+    one = some(honest, "covariance", rows=honest["link"] == 0.8)
+    copies = {name: np.concatenate([column] * 3) for name, column in one.items()}
+    copies["link"] = np.repeat([0.8, 0.81, 0.82], len(one["run"]))
+    against = sf.predict(SCENARIO, [0.8, 0.8, 0.8], "general", estimator="naive")
+    single = sf.predict(SCENARIO, [0.8], "general", estimator="naive")
+    assert checked(copies, against).p_together == pytest.approx(min(1.0, 3 * checked(one, single).p_together))
 
 
 def test_means_have_no_blocks():
@@ -454,6 +477,17 @@ def test_honest_simulators_are_not_accused_beyond_the_level(prediction, runs):
         found = some(
             table(naive, LINKS, runs, np.random.default_rng(1000 + seed)), "covariance", "squared_error", "nees"
         )
+        wrong += not checked(found, prediction, alpha=0.05).agrees
+    assert wrong <= binom.ppf(0.999, 200, 0.05)
+
+
+@pytest.mark.slow
+def test_nor_are_they_where_one_seed_serves_all_links(prediction):
+    """Links that are simulated with the same random numbers tell the same twice."""
+    wrong = 0
+    for seed in range(200):
+        parts = [table(naive, [µ], 1200, np.random.default_rng(5000 + seed)) for µ in LINKS]
+        found = {name: np.concatenate([part[name] for part in parts]) for name in (*INDEX, "covariance", "nees")}
         wrong += not checked(found, prediction, alpha=0.05).agrees
     assert wrong <= binom.ppf(0.999, 200, 0.05)
 
