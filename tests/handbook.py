@@ -35,7 +35,8 @@ CHAPTERS = {
     "Sensors by name": "scenario.sensing",
     "What rounding can do": "engines.precision",
     "What a simulator's values are distributed like": "data.expected",
-    "Whether a simulator is right": "data.crosscheck",
+    "How a simulator's cells are judged": "data.cells",
+    "All cells together": "data.together",
 }
 
 

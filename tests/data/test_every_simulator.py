@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import binom, chi2, norm
 
 import stochfuse as sf
-from stochfuse.data import crosscheck
+from stochfuse.data import cells
 from stochfuse.data.expected import Law, Parts
 from stochfuse.data.results import ResultsError, read_results
 from stochfuse.kalman.metrics import metric
@@ -184,7 +184,7 @@ def test_runs_that_have_one_step_each(honest, prediction):
     lonely = checked(apart, prediction)
     for a, b in zip(found.cells, lonely.cells, strict=True):
         assert (a.runs, a.mean, a.z) == (b.runs, pytest.approx(b.mean), pytest.approx(b.z, abs=1e-6))
-    within = crosscheck._within(np.array([1, 0, 1, 1, 0]), np.array([5, 7, 9, 5, 8]))
+    within = cells._within(np.array([1, 0, 1, 1, 0]), np.array([5, 7, 9, 5, 8]))
     assert within.tolist() == [0, 0, 1, 0, 1]
 
 
@@ -350,6 +350,34 @@ def test_what_does_not_fit_is_said(columns, message):
         given = {name: column[:1] for name, column in given.items()}
     with pytest.raises(ResultsError, match=message):
         sf.crosscheck(given, SCENARIO, estimator="naive")
+
+
+def test_scenarios_that_do_not_fit():
+    one = {"run": [1, 2], "step": [1, 1]}
+    with pytest.raises(ResultsError, match="row 1, column 'link': expected a link probability or a case, as in other rows, got nothing"):  # fmt: skip
+        sf.crosscheck({**one, "link": ["0.5", ""], "nees": [1, 2]}, SCENARIO)
+    with pytest.raises(ResultsError, match="expected a column 'link', since the scenario has no link of its own; or --link"):  # fmt: skip
+        sf.crosscheck({**one, "nees": [1, 2]}, SCENARIO)
+    with pytest.raises(ResultsError, match=r"row 1, column 'step': expected at most the scenario's 3 steps, got 4; see --steps"):  # fmt: skip
+        sf.crosscheck({"run": [1, 2], "step": [1, 4], "nees": [1, 2]}, SCENARIO, link=0.5)
+    unlike = {**SCENARIO, "agent": [{"R": 1.0}, {}]}
+    with pytest.raises(ResultsError, match="arrays: the agents differ: expected a column 'agent', got none"):
+        sf.crosscheck({**one, "nees": [1, 2]}, unlike, link=0.5)
+    flat = {**SCENARIO, "initial": {"P": [[1.0, 0.0], [0.0, 0.0]]}}
+    with pytest.raises(sf.UsageError, match="column 'nees': expected claimed covariances that can be inverted, got a singular one"):  # fmt: skip
+        sf.crosscheck({**one, "nees": [1, 2]}, flat, link=0.5, estimator="stand-alone")
+    scalar = {"model": {"F": 1, "H": 1, "Q": 1, "R": 1}, "initial": {"P": 1}, "network": {"agents": 2, "steps": 1}}
+    claimed = sf.predict(scalar, [0.5], "general")
+    with pytest.raises(ResultsError, match="arrays: nothing to compare"):
+        checked({**one, "error": [1.0, 2.0]}, claimed)
+
+
+def test_a_file_without_a_single_value_disagrees(tmp_path):
+    found = sf.crosscheck({"run": [1, 2], "step": [1, 1], "covariance": [None, None], "nees": [None, None]}, SCENARIO, link=0.5)  # fmt: skip
+    assert (found.agrees, found.cells, found.blocks) == (False, [], ())
+    assert found.evidence == ("2 of 2 rows hold no covariance and no nees, first at row 0",)
+    assert "2 of 2 rows hold no covariance" in found._repr_html_()
+    assert len(found.plot().axes) == 1
 
 
 def test_requests_that_do_not_fit(honest):
