@@ -34,6 +34,9 @@ CHAPTERS = {
     "Models by name": "scenario.motion",
     "Sensors by name": "scenario.sensing",
     "What rounding can do": "engines.precision",
+    "What a simulator's values are distributed like": "data.expected",
+    "How a simulator's cells are judged": "data.cells",
+    "All cells together": "data.together",
 }
 
 

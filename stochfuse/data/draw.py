@@ -148,8 +148,7 @@ def _check_one_truth(truth: np.ndarray) -> None:
     if apart > 1e-9 * np.abs(truth).max():
         raise UsageError(
             "simulate: expected filters that follow one true state, got parallel filters whose process noises "
-            "([[agent]] Q, noise.process) move their states apart; what is predicted of them are errors, each about its "
-            "own state"
+            "([[agent]] Q, noise.process) move their states apart; predicted are errors, each about its own state"
         )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from typing import Any
 
+from stochfuse.data.crosscheck import Verdict
 from stochfuse.data.run import RunResult
 from stochfuse.errors import UsageError, needed
 from stochfuse.estimators.fusion_graph import FusionGraph
@@ -19,7 +20,16 @@ from stochfuse.questions.least_link import LeastLink
 from stochfuse.questions.least_value import LeastValue
 from stochfuse.questions.messages import MessageLoad, SweptLoad
 from stochfuse.questions.sensitivity import Sensitivity, ShareOfGain
-from stochfuse.report import comparisons, fusion_graph, links, messages, predictions, solutions, study_figures
+from stochfuse.report import (
+    comparisons,
+    crosschecks,
+    fusion_graph,
+    links,
+    messages,
+    predictions,
+    solutions,
+    study_figures,
+)
 from stochfuse.report.critical import critical_report
 from stochfuse.report.plot import figure_class
 from stochfuse.report.predictions import PredictionView
@@ -62,6 +72,8 @@ def report_of(result: Any, of: str | None = None, agent: int | str = "mean") -> 
         return run_report(result)
     if isinstance(result, ExpectedStates):
         return states_report(StatesView(result, agent))
+    if isinstance(result, Verdict):
+        return crosschecks.crosscheck_report(crosschecks.CrosscheckView(result))
     scenario = (result if isinstance(result, Prediction | Swept) else result.predictions[0]).scenario
     chosen = metric(of or scenario.metric or "trace", scenario.model)
     if isinstance(result, EstimatorComparison):
