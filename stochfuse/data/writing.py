@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse.data.columns import SUFFIXES
 from stochfuse.data.records import Batch
 from stochfuse.data.run import Estimates
+from stochfuse.data.tables import SUFFIXES
 from stochfuse.engines.replay import Arrivals
 from stochfuse.errors import UsageError, needed
 from stochfuse.scenario.scenario import Scenario

@@ -224,7 +224,7 @@ def _with_lowest(E: Function, grid: list[float], values: np.ndarray) -> tuple[li
 
     i = int(np.argmin(values))
     ends = grid[max(i - 1, 0)], grid[min(i + 1, len(grid) - 1)]
-    found = minimize_scalar(E, bounds=ends, method="bounded", options={"xatol": 1e-9 * (ends[1] - ends[0])})
+    found: Any = minimize_scalar(E, bounds=ends, method="bounded", options={"xatol": 1e-9 * (ends[1] - ends[0])})
     lowest = float(found.x)
     place = int(np.searchsorted(grid, lowest))
     return [*grid[:place], lowest, *grid[place:]], np.insert(values, place, found.fun)
