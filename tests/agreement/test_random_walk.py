@@ -34,7 +34,7 @@ from tests.oracles import random_scenarios
 
 SEED = int(os.environ.get("STOCHFUSE_WALK_SEED", "1"))
 SECONDS = float(os.environ.get("STOCHFUSE_WALK_SECONDS", "60"))
-QUICK_STEPS = 150
+QUICK_STEPS = 60
 CALLS_PER_SCENARIO = 3
 LIMIT = 20.0
 """Seconds of processor time that a call on a scenario of this size may take."""

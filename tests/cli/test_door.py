@@ -104,7 +104,7 @@ def test_what_is_quick_says_nothing():
 def test_ctrl_c_ends_long_work_within_a_second():
     words = [sys.executable, "-m", "stochfuse", "compare", "--quantity", "consistency"]
     work = subprocess.Popen(words, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    time.sleep(3)
+    time.sleep(2)
     start = time.monotonic()
     work.send_signal(signal.SIGINT)
     _, stderr = work.communicate(timeout=10)

@@ -68,11 +68,10 @@ def test_many_agents(architecture, agents):
 
 
 def test_certain_outcomes_have_no_error():
-    p = sf.predict(sf.load_scenario(), [0.0, 1.0], method="monte-carlo", runs=10)
+    scenario = sf.load_scenario(steps=3)
+    p = sf.predict(scenario, [0.0, 1.0], method="monte-carlo", runs=10)
     np.testing.assert_allclose(p.standard_error(), 0, atol=1e-12)
-    np.testing.assert_allclose(
-        p.values(), sf.predict(sf.load_scenario(), [0.0, 1.0], method="general").values(), rtol=1e-12
-    )
+    np.testing.assert_allclose(p.values(), sf.predict(scenario, [0.0, 1.0], method="general").values(), rtol=1e-12)
 
 
 def test_errors_of_one_agent_and_of_the_worst():

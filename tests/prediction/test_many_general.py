@@ -182,8 +182,8 @@ def test_blocks_and_repeated_noises_change_nothing(monkeypatch, errors):
             if M is not None:
                 assert_close(N, M, 1e-13)
     general._kept.cache_clear()
-    alone = [batch("general", scenario, link[[i]], noises.take([i]), errors=errors) for i in range(40)]
-    np.testing.assert_allclose(whole[0].rounding, [a.rounding[0] for a in alone], rtol=1e-9)
+    alone = [batch("general", scenario, link[[i]], noises.take([i]), errors=errors) for i in range(0, 40, 4)]
+    np.testing.assert_allclose(whole[0].rounding[::4], [a.rounding[0] for a in alone], rtol=1e-9)
 
 
 @pytest.mark.parametrize("method", ["general", "naive", "optimal"])

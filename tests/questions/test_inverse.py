@@ -555,7 +555,7 @@ def test_least_link_on_the_command_line():
     )
     assert found["certificate"]["below"]["value"] > 30 >= found["certificate"]["above"]["value"]
     assert found["met"] == [[found["link"], 1.0]]
-    value = sf.predict(sf.load_scenario(), [found["link"]], "general").values()[0, 2]
+    value = sf.predict(sf.load_scenario(steps=3), [found["link"]], "general").values()[0, 2]
     assert value == pytest.approx(30, rel=1e-12)
 
 

@@ -148,7 +148,7 @@ def test_bursty_links_are_no_hindrance():
     base["network"] |= {"burst": {"good_to_bad": 0.2, "bad_to_good": 0.4}, "steps": 3}
     found = sf.least_value(base, 2.0, "model.R", (0.5, 20), method="general", quantity="actual")
     values = []
-    for r in np.linspace(0.5, 20, 40):
+    for r in np.linspace(0.5, 20, 16):
         mapping = copy.deepcopy(base)
         mapping["model"]["R"] = float(r)
         values.append((r, float(sf.predict(mapping, method="general", quantity="actual").values()[0, -1])))

@@ -8,7 +8,7 @@ import math
 import random
 import re
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -24,13 +24,19 @@ from stochfuse.studies.evaluation import evaluate
 from stochfuse.studies.files import Columns
 from stochfuse.studies.reading import load_study
 
-EXAMPLES = 500
-"""Per test; two tests each for scenarios and studies."""
+FEW, MANY = 120, 700
+"""Examples of a test; two tests each for scenarios and studies."""
 MOST_STEPS, MOST_AGENTS = 4, 6
 """What is predicted is cut to that: a scenario may be right and long."""
-SLOW = settings(
-    max_examples=EXAMPLES, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow], database=None
-)
+LONG = settings(deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow], database=None)
+LENGTHS = [FEW, pytest.param(MANY, marks=pytest.mark.slow)]
+
+
+def each(names: Iterable[str], examples: int, check: Callable[[str, int], None]) -> None:
+    """Check so many examples of a name and a seed."""
+    drawn = given(st.sampled_from(sorted(names)), st.integers(0, 2**32))
+    settings(LONG, max_examples=examples)(drawn(check))()
+
 
 PRESETS = {name: read_text(name)[1] for name in preset_names()}
 SMALL = """
@@ -256,17 +262,21 @@ def read_and_predict(source: dict[str, Any] | Callable[[], sf.Scenario]) -> str:
     return "predicted"
 
 
-@SLOW
-@given(st.sampled_from(sorted(PRESETS)), st.integers(0, 2**32))
-def test_scenario_texts(name, seed):
-    text = mutated_text(random.Random(seed), PRESETS[name])
-    read_and_predict(lambda: sf.Scenario.from_mapping(parse("mine.toml", text), "mine.toml"))
+@pytest.mark.parametrize("examples", LENGTHS)
+def test_scenario_texts(examples):
+    def check(name, seed):
+        text = mutated_text(random.Random(seed), PRESETS[name])
+        read_and_predict(lambda: sf.Scenario.from_mapping(parse("mine.toml", text), "mine.toml"))
+
+    each(PRESETS, examples, check)
 
 
-@SLOW
-@given(st.sampled_from(sorted(PRESETS)), st.integers(0, 2**32))
-def test_scenario_values(name, seed):
-    read_and_predict(mutated_mapping(random.Random(seed), tomllib.loads(PRESETS[name])))
+@pytest.mark.parametrize("examples", LENGTHS)
+def test_scenario_values(examples):
+    def check(name, seed):
+        read_and_predict(mutated_mapping(random.Random(seed), tomllib.loads(PRESETS[name])))
+
+    each(PRESETS, examples, check)
 
 
 def read_and_evaluate(mapping: dict[str, Any]) -> str:
@@ -299,22 +309,26 @@ def read_and_evaluate(mapping: dict[str, Any]) -> str:
     return "evaluated"
 
 
-@SLOW
-@given(st.sampled_from(sorted(STUDIES)), st.integers(0, 2**32))
-def test_study_texts(name, seed):
-    text = mutated_text(random.Random(seed), STUDIES[name])
-    try:
-        mapping = parse("mine.toml", text)
-    except sf.ScenarioError as error:
-        told(error)
-        return
-    read_and_evaluate(mapping)
+@pytest.mark.parametrize("examples", LENGTHS)
+def test_study_texts(examples):
+    def check(name, seed):
+        text = mutated_text(random.Random(seed), STUDIES[name])
+        try:
+            mapping = parse("mine.toml", text)
+        except sf.ScenarioError as error:
+            told(error)
+            return
+        read_and_evaluate(mapping)
+
+    each(STUDIES, examples, check)
 
 
-@SLOW
-@given(st.sampled_from(sorted(STUDIES)), st.integers(0, 2**32))
-def test_study_values(name, seed):
-    read_and_evaluate(mutated_mapping(random.Random(seed), tomllib.loads(STUDIES[name])))
+@pytest.mark.parametrize("examples", LENGTHS)
+def test_study_values(examples):
+    def check(name, seed):
+        read_and_evaluate(mutated_mapping(random.Random(seed), tomllib.loads(STUDIES[name])))
+
+    each(STUDIES, examples, check)
 
 
 def test_mutations_are_neither_harmless_nor_hopeless():

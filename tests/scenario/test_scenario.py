@@ -276,7 +276,9 @@ def test_presets_pass_the_check_that_their_loading_skips_and_survive_json(name, 
     file = tmp_path / "again.json"
     file.write_text(json.dumps(loaded.to_mapping()))
     again = sf.load_scenario(file)
-    np.testing.assert_array_equal(sf.predict(again).covariance, sf.predict(loaded).covariance)
+    assert again.to_mapping() == loaded.to_mapping()
+    few = min(loaded.network.steps, 4)
+    np.testing.assert_array_equal(sf.predict(again.until(few)).covariance, sf.predict(loaded.until(few)).covariance)
 
 
 def test_overrides_take_the_place_of_keys():

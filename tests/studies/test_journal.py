@@ -325,8 +325,13 @@ class JournalMachine(RuleBasedStateMachine):
                 assert self.output.read_bytes() == whole(version)
 
 
-JournalMachine.TestCase.settings = settings(max_examples=150, stateful_step_count=25, deadline=None, derandomize=True)
-TestJournal = JournalMachine.TestCase
+class TestJournal(JournalMachine.TestCase):
+    settings = settings(max_examples=60, stateful_step_count=25, deadline=None, derandomize=True)
+
+
+@pytest.mark.slow
+class TestJournalAtLength(JournalMachine.TestCase):
+    settings = settings(max_examples=300, stateful_step_count=25, deadline=None, derandomize=True)
 
 
 def test_parts_are_not_trusted_without_the_record_of_what_they_are(tmp_path):
@@ -412,8 +417,15 @@ def test_all_writes_are_among_the_faults(name, tmp_path, small_chunks):
     assert len(writes) >= 5 + 3
 
 
-@pytest.mark.parametrize("stays", [False, True], ids=["once", "stays full"])
-@pytest.mark.parametrize("name", ["result.csv", "result.parquet"])
+@pytest.mark.parametrize(
+    ("name", "stays"),
+    [
+        ("result.csv", True),
+        ("result.parquet", False),
+        pytest.param("result.csv", False, marks=pytest.mark.slow),
+        pytest.param("result.parquet", True, marks=pytest.mark.slow),
+    ],
+)
 def test_a_full_disk_at_every_operation(name, stays, tmp_path, small_chunks):
     expected, done = uninterrupted(tmp_path, name)
     refused = set()
@@ -436,8 +448,18 @@ def test_a_full_disk_at_every_operation(name, stays, tmp_path, small_chunks):
     assert refused >= {"mkdir", "open", "write", "close", "fsync", "replace"}
 
 
-@pytest.mark.parametrize(("share", "power"), [(0.0, False), (1.0, False), (0.5, True)])
-@pytest.mark.parametrize("name", ["result.csv", "result.parquet"])
+@pytest.mark.parametrize(
+    ("name", "share", "power"),
+    [
+        ("result.csv", 0.5, True),
+        ("result.parquet", 1.0, False),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in [("result.csv", 0.0, False), ("result.csv", 1.0, False)]
+            + [("result.parquet", 0.0, False), ("result.parquet", 0.5, True)]
+        ),
+    ],
+)
 def test_killed_at_every_operation(name, share, power, tmp_path, small_chunks):
     expected, done = uninterrupted(tmp_path, name)
     for at in range(1, len(done) + 1):

@@ -159,10 +159,18 @@ def forked():
 
 
 ROUNDS = [
-    ("sampled", ".csv", "1", 6),
-    ("sampled", ".parquet", "1", 5),
-    ("sampled", ".parquet", "2", 4),
-    ("large", ".csv", "1", 5),
+    ("sampled", ".csv", "1", 3),
+    ("sampled", ".parquet", "2", 2),
+    ("large", ".csv", "1", 2),
+    *(
+        pytest.param(*case, marks=pytest.mark.slow)
+        for case in [
+            ("sampled", ".csv", "1", 6),
+            ("sampled", ".parquet", "1", 6),
+            ("sampled", ".parquet", "2", 6),
+            ("large", ".csv", "1", 6),
+        ]
+    ),
 ]
 
 
@@ -183,10 +191,11 @@ def test_kills_at_random_moments(name, suffix, workers, rounds, tmp_path, quiet,
             assert wait_until(lambda: folder.exists() or output.exists(), 30), log.read_text()
         time.sleep(moment.uniform(0.0, 0.5 * seconds + (int(workers) - 1)))
         theirs = descendants(process.pid)
-        process.kill()
+        moment.choice((process.kill, process.terminate))()
         (process.join if workers == "1" else process.wait)()
         assert wait_until(lambda theirs=theirs: not any(map(alive, theirs)), 10), "workers stay behind"
-        assert "Traceback" not in log.read_text()
+        # Python's tracker of what was left behind is one of them, and need say nothing either
+        assert not re.search("Traceback|Warning|leaked", log.read_text())
         found = parts(output)
         assert output.exists() or kept.items() <= found.items()
         kept = found
