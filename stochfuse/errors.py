@@ -40,7 +40,7 @@ class ScenarioError(StochfuseError, ValueError):
     """
 
     def __init__(self, source: str, problems: Iterable[Problem] | str):
-        self.source = source
+        self.source = source = source if source.isprintable() else repr(source)
         self.problems = () if isinstance(problems, str) else tuple(problems)
         text = problems if isinstance(problems, str) else "".join(f"\n  {p}" for p in self.problems)
         super().__init__(f"{source}:{' ' if isinstance(problems, str) else ''}{text}")

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 ALL = "all"
 DEFAULT = (GENERAL, SIMPLIFIED, NAIVE, MONTE_CARLO)
 EXAMPLES = (
-    "stochfuse compare --methods general,simplified --link 0.5 --relative",
+    "stochfuse compare --methods general,simplified --link 0.5 --steps 4 --relative",
     "stochfuse compare --estimator naive,split-ci,optimal --link 0.2,0.8 --steps 3",
 )
 

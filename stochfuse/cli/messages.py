@@ -21,6 +21,7 @@ from stochfuse.cli.options import (
     choice,
     option,
     settings_for,
+    whole,
 )
 from stochfuse.errors import UsageError
 from stochfuse.scenario.registry import GENERAL, LFG, MONTE_CARLO, NAIVE
@@ -109,7 +110,7 @@ def messages(
     given = swept.longest if swept else given
     check_memory(given, links, to.kind, len(swept.points) if swept else 1)
     first, last = _window(given.network.steps, from_step, step)
-    whose = int(agent) if agent.isdigit() else agent
+    whose = whole(agent) or agent
     wanted = [each for each in RULES if rule in (each, BOTH)]
     of_rule = {
         each: message_load(given, links, each, method=method, over=swept, **drawn).between(first, last)

@@ -321,6 +321,11 @@ def gathered(command: Callable[..., None]) -> Callable[..., None]:
     return laid_out
 
 
+def whole(text: str) -> int | None:
+    """Return the whole number that a text is; None if it is none (superscripts are digits too), or a huge one."""
+    return int(text) if text.isdecimal() and len(text) < 19 else None
+
+
 def whose(agent: str | None, scenario: Scenario) -> int | str:
     """Return the agent asked for: a number, or mean, worst or best.
 
@@ -329,7 +334,7 @@ def whose(agent: str | None, scenario: Scenario) -> int | str:
     UsageError
         If there is no such agent.
     """
-    chosen = (scenario.agent or "mean") if agent is None else int(agent) if agent.isdigit() else agent
+    chosen = (scenario.agent or "mean") if agent is None else whole(agent) or agent
     most = scenario.network.agents
     if chosen not in ("mean", "worst", "best") and not (isinstance(chosen, int) and 1 <= chosen <= most):
         raise UsageError(f"agent: expected mean, worst, best or a number from 1 to {most}, got '{agent}'")
@@ -377,7 +382,7 @@ def steps_at(text: str | None, scenario: Scenario) -> tuple[int, ...] | None:
         return None
     last, found = scenario.network.steps, set()
     for word in text.split(","):
-        step = last if word.strip() == "last" else int(word) if word.strip().isdigit() else 0
+        step = last if word.strip() == "last" else whole(word.strip()) or 0
         if not 1 <= step <= last:
             raise UsageError(f"--at: expected steps from 1 to {last}, or last, got '{word.strip()}'")
         found.add(step)

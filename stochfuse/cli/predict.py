@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 EXAMPLES = (
     "stochfuse predict --agents 50 --link 0:1:0.25 --steps 4",
-    "stochfuse predict --method general --quantity claimed,actual --link 0.5",
+    "stochfuse predict --method general --quantity claimed,actual --steps 3",
     "stochfuse predict --over model.R=50:200:25 --link 0.5",
 )
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 QUESTION = "Options"
 EXAMPLES = (
-    "stochfuse solve --target 30 --method general",
+    "stochfuse solve --target 30 --method general --steps 3",
     "stochfuse solve --target 25 --agents-needed --link 0.5",
 )
 

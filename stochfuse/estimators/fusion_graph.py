@@ -23,8 +23,10 @@ from stochfuse.estimators.protocol import Late
 from stochfuse.estimators.world import sources_of
 from stochfuse.kalman.checks import shown
 from stochfuse.kalman.kernel import Estimate, from_information
+from stochfuse.scenario.capabilities import require
 from stochfuse.scenario.checker import Checker
-from stochfuse.scenario.scenario import Scenario, parse, read_file
+from stochfuse.scenario.registry import GENERAL, LFG
+from stochfuse.scenario.scenario import Scenario, link_rows, parse, read_file
 
 SCHEMA = "stochfuse.history/1"
 MOST_NODES = 2000
@@ -276,7 +278,8 @@ class FusionGraph:
         Raises
         ------
         UsageError
-            If the scenario or the measurements have other numbers of agents or too few steps.
+            If the scenario or the measurements have other numbers of agents or too few steps, or the Local Fusion
+            Graph does not take what the scenario has.
         NoAnswerError
             If the graph claims information that is not positive definite, which it can in several dimensions.
         """
@@ -291,6 +294,7 @@ class FusionGraph:
             raise UsageError(
                 f"measurements: expected shape (steps, agents, p) = ({steps}, {n}, p), got {records.shape}"
             )
+        require(scenario.system, link_rows(scenario), LFG, GENERAL)
         values = evaluate(self.ledger, sources_of(scenario.system, records, by_agent=True))
         for (_, step), value in self._fused.items():
             check_definite(values.Y[value], step)

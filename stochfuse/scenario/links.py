@@ -634,7 +634,9 @@ def _natural(nodes: Sequence[str] | np.ndarray) -> tuple[list[str], np.ndarray]:
     import re
 
     def key(name: str) -> list[tuple[int, int, str]]:
-        return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]
+        # longer numbers are larger
+        parts = [part.lstrip("0") if part.isdecimal() else part for part in re.split(r"(\d+)", name) if part]
+        return [(0, len(part), part) if not part or part.isdecimal() else (1, 0, part) for part in parts]
 
     order = sorted(range(len(nodes)), key=lambda i: key(str(nodes[i])))
     places = np.empty(len(nodes), dtype=int)

@@ -181,7 +181,7 @@ def _work(
 def _answered(
     executor: Executor, width: int, record: str, todo: Iterable[int], given: bool
 ) -> Iterator[tuple[int, bytes]]:
-    """Chunks with their answers as they come; no more than a few are under way, and none stays with a given executor."""
+    """Chunks with their answers as they come, few under way at a time; none stays with an executor that was given."""
     waiting, chunks = {}, iter(todo)
     try:
         while True:

@@ -87,7 +87,7 @@ WRONG = (
     "", " ", "nan", "inf", "-inf", "-1", "0", "1e400", "1e-400", "1e300", "x", "1,2", "0:1", "1:0:1", "0:1:0", "1.5", "²",
     "٣", "½", "10000000000000000000000", "true", "None", "a b", ",", "1,,2", ":", "=", "x=", "=1", "%", "-5%", "\udc80", "µ",
     "0x10", "1_0", "--", "-", ".", "mine.toml", "nowhere.toml", "text.md", "last", "trace", "naive", "rms:", "rms:,", "var:q",
-    "quantile:", "quantile:2", "quantile:nan", "at-most:", "at-most:nan", "{}", "[1]", "[[x]]", "\u202e", "\n", "a=b=c",
+    "quantile:", "quantile:2", "quantile:nan", "at-most:", "at-most:nan", "{}", "[1]", "[[x]]", "\u202e", "a=b=c",
 )  # fmt: skip
 SCENARIOS = (
     *("thesis-transient",) * 8, "thesis-steady", "cv-2d", "cv-2d", "two-radars", "parallel-filters", "cooperative-pnt",
@@ -169,7 +169,18 @@ ARGUMENTS: dict[str, Sequence[str]] = {
     "crosscheck": ("means.csv", "runs.csv", "means.json", "wrong.csv", "empty.csv", "log.csv", "mine.toml"),
     "reproduce": ("table-3", "figure-0", "table-99"),
     "study": ("study.toml", "study.toml", "trade.json", "mine.toml", "nowhere.toml"),
-    "links": ("log.csv", "log.csv", "log.csv", "matrix.csv", "matrix.csv", "runs.csv", "empty.csv", "mine.toml", "road-5", "text.md"),
+    "links": (
+        "log.csv",
+        "log.csv",
+        "log.csv",
+        "matrix.csv",
+        "matrix.csv",
+        "runs.csv",
+        "empty.csv",
+        "mine.toml",
+        "road-5",
+        "text.md",
+    ),
     "explain": tuple(explanations()),
     "scenario new": ("cv-2d", "mine.toml"),
 }
@@ -205,9 +216,13 @@ def options() -> dict[str, tuple[Flag, ...]]:
     found = {}
     for name in COMMANDS:
         command = root.get_command(None, name)
-        for path, each in {f"{name} {sub}": one for sub, one in getattr(command, "commands", {name: command}).items()}.items():
+        for path, each in {
+            f"{name} {sub}": one for sub, one in getattr(command, "commands", {name: command}).items()
+        }.items():
             flags = [p for p in each.params if p.param_type_name == "option" and "--help" not in p.opts]
-            found[path if path != f"{name} {name}" else name] = tuple(Flag(max(p.opts, key=len), not p.is_flag) for p in flags)
+            found[path if path != f"{name} {name}" else name] = tuple(
+                Flag(max(p.opts, key=len), not p.is_flag) for p in flags
+            )
     return found
 
 
@@ -235,13 +250,26 @@ def line(pick: random.Random) -> list[list[str]]:
         method = "--methods" if command == "compare" else "--method"
         drawn = [flag for flag in drawn if flag.name != method or not methods]
         words += [[method, "monte-carlo" if command == "messages" else methods[0]]] if methods else []
-    words += [[flag.name, value(pick, command, flag.name)] if flag.takes or flag.name == "--over" else [flag.name] for flag in drawn if flag.name != "--dask"]
+    words += [
+        [flag.name, value(pick, command, flag.name)] if flag.takes or flag.name == "--over" else [flag.name]
+        for flag in drawn
+        if flag.name != "--dask"
+    ]
     names, text = {flag.name for flag in drawn}, str(words)
     for flag, small in SMALL.items():
-        unasked = (flag == "--runs" and "monte-carlo" not in text and command != "compare") or (flag == "--max-graphs" and "general" not in text)
-        unasked |= flag == "--agents" and any(name in text for name in ("agents", ".toml", "two-radars", "filters", "pnt"))
+        unasked = (flag == "--runs" and "monte-carlo" not in text and command != "compare") or (
+            flag == "--max-graphs" and "general" not in text
+        )
+        unasked |= flag == "--agents" and any(
+            name in text for name in ("agents", ".toml", "two-radars", "filters", "pnt")
+        )
         unasked |= flag == "--link" and any(name in text for name in ("'--target']", "critical", "network.link"))
-        if Flag(flag, True) in have and not unasked and flag not in names and pick.random() < (0.3 if flag == "--link" else 0.9):
+        if (
+            Flag(flag, True) in have
+            and not unasked
+            and flag not in names
+            and pick.random() < (0.3 if flag == "--link" else 0.9)
+        ):
             words.append([flag, OWN.get((command, flag), (small,))[0]])
     if pick.random() < 0.4 and Flag("--format", True) in have and "--format" not in names:
         words.append(["--format", "json"])
@@ -292,7 +320,9 @@ def judged(words: Sequence[str]) -> Failure | int:
 
 def _fault(words: Sequence[str], code: int, out: str, err: str, new: set[str]) -> str:
     """What is wrong with what a command said."""
-    messages = [text for text in err.splitlines() if re.match(r"(error|Error|no answer|internal error|interrupted):?", text)]
+    messages = [
+        text for text in err.splitlines() if re.match(r"(error|Error|no answer|internal error|interrupted):?", text)
+    ]
     if "Traceback" in err or "internal error" in err:
         return "internal error"
     if code not in (0, 2, 3) and not (code == 1 and words[0] == "crosscheck" and "disagree" in err):
@@ -313,7 +343,11 @@ def _fault(words: Sequence[str], code: int, out: str, err: str, new: set[str]) -
             strict_json(out)
         except (AssertionError, ValueError) as error:
             return f"JSON: {error}"
-    if code in (0, 1) and re.search(r"(?<![\w-])(nan|inf|NaN|None)(?![\w-])", out) and words[0] in ("predict", "compare", "solve", "messages"):
+    if (
+        code in (0, 1)
+        and re.search(r"(?<![\w-])(nan|inf|NaN|None)(?![\w-])", out)
+        and words[0] in ("predict", "compare", "solve", "messages")
+    ):
         return "no number"
     return ""
 

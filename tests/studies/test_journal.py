@@ -455,8 +455,12 @@ def test_a_full_disk_at_every_operation(name, stays, tmp_path, small_chunks):
         ("result.parquet", 1.0, False),
         *(
             pytest.param(*case, marks=pytest.mark.slow)
-            for case in [("result.csv", 0.0, False), ("result.csv", 1.0, False)]
-            + [("result.parquet", 0.0, False), ("result.parquet", 0.5, True)]
+            for case in [
+                ("result.csv", 0.0, False),
+                ("result.csv", 1.0, False),
+                ("result.parquet", 0.0, False),
+                ("result.parquet", 0.5, True),
+            ]
         ),
     ],
 )
