@@ -127,7 +127,7 @@ def test_agreement(network, engine, estimator):
     P, x = oracle(network, estimator)
     rows = link_rows(scenario)
     if engine == "monte-carlo":
-        p = sf.predict(scenario, method="monte-carlo", estimator=estimator, runs=4000, seed=3, workers=1)
+        p = sf.predict(scenario, method="monte-carlo", estimator=estimator, runs=1500, seed=3, workers=1)
         for agent in range(1, case.agents + 1):
             error = p.standard_error("trace", agent)[0]
             difference = p.values("trace", agent)[0] - np.trace(P[:, agent - 1], axis1=-2, axis2=-1)

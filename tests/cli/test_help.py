@@ -50,8 +50,9 @@ def test_every_option_stands_in_a_panel():
             assert f"\n{panel}\n" in text, (command, panel)
 
 
+LONG = ("stochfuse reproduce figure-32 --plot figure-32.png",)
 RUN = [
-    example
+    pytest.param(example, marks=pytest.mark.slow) if example in LONG else example
     for name in PLAIN
     for example in import_module(f"stochfuse.cli.{name}").EXAMPLES
     if not any(word in example for word in (".toml", ".csv", "means.json"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ INTERSECTIONS = ("covariance-intersection", "split-ci")
 BLENDERS = ("blender", "joint-blender")
 EQUIVALENTS = ("equivalent-measurement", "independent-measurements")
 OWN = ("stand-alone", *INTERSECTIONS, "lwin", "itns")
+SINGULAR = tuple(name for name in ONE_STATE if name not in INTERSECTIONS)
 UNLIKE_SENSORS = tuple(name for name in ONE_STATE if name not in EQUIVALENTS)
 QUANTITIES = ("claimed", "actual", "bias", "rms")
 
@@ -80,6 +82,14 @@ def parallel_filters(seed):
     return source | {"noise": {"process": process.tolist(), "correlation": c, "disturbance": 0.3}}
 
 
+def singular(seed, **given):
+    """Two states, some of whose matrices are singular."""
+    source = one_state(seed, 2, 1, 2, 2, link=[[0, 0.6], [0.3, 0]])
+    source["initial"] |= {key: M for key, M in given.items() if key == "P"}
+    source["model"] |= {key: M for key, M in given.items() if key != "P"}
+    return source
+
+
 SPARSE = [[0, 0.2, 0.7], [0, 0, 0], [0.8, 0, 0]]
 ONE_WAY = [[0, 0.5, 0], [0, 0, 0.7], [0, 0, 0]]
 TRIANGLE = [[0, 0], [10, 2], [3, 8]]
@@ -124,8 +134,24 @@ CASES = {
                        {"agents": [3, 2], "direction": 0.1, "both_ways": False},
                        {"agents": [3, 1], "none": True}]}, d=4, architecture="broadcast"), OWN),
     "parallel filters": (parallel_filters(20), BLENDERS),
+    "delays, unequal": (
+        one_state(21, 2, 1, 2, 3, link=0.6, network={"delay": [[0, [0.3, 0.7]], [1, 0]]}), INTERSECTIONS),
+    "a sensor that pauses": (
+        one_state(22, 2, 1, 2, 3, link=0.6, agent=[{"H": [[[1, 0.5]], [[0, 0]], [[1, 0.5]]]}, {}]), UNLIKE_SENSORS),
+    "a direction without process noise": (singular(23, Q=[[1.0, 0.5], [0.5, 0.25]]), ONE_STATE),
+    "a direction that is forgotten": (singular(24, F=[[1.0, 0.5], [2.0, 1.0]]), ONE_STATE),
+    "a direction known from the start": (singular(25, P=[[4.0, 2.0], [2.0, 1.0]]), SINGULAR),
+    "a direction known from step 2 on": (
+        singular(26, F=[[1.0, 0.5], [0.0, 0.0]], Q=[[1.0, 0.0], [0.0, 0.0]]), SINGULAR),
 }  # fmt: skip
 MATRIX = [(case, estimator) for case, (_, estimators) in CASES.items() for estimator in estimators]
+MATRIX += [
+    (case, estimator)
+    for case, (source, estimators) in CASES.items()
+    for estimator in textbook_estimators.PEDIGREES
+    if estimators in (ONE_STATE, UNLIKE_SENSORS) and not (estimator == "optimal" and "noise" in source)
+]
+MATRIX += [("delays, unequal", "optimal")]
 
 
 @cache
@@ -173,6 +199,61 @@ def test_monte_carlo(case, estimator):
             error = np.asarray(shown.standard_error("trace", agent))[0]
             difference = shown.values("trace", agent)[0] - np.trace(exact[quantity][:, agent - 1], axis1=1, axis2=2)
             assert (np.abs(difference) <= 4.5 * error + 1e-9 * np.abs(exact[quantity]).max()).all()
+
+
+EVERY = (*ONE_STATE, *textbook_estimators.PEDIGREES)
+TAKEN = [(estimator, engine) for estimator in EVERY for engine in ("general", "monte-carlo")] + [("optimal", "chain")]
+
+
+def agrees(p, row, expected):
+    """Claims of one row of links are those expected, exactly or within their error."""
+    for agent in range(1, expected.shape[1] + 1):
+        if p.sampled is None:
+            close(p.of_agent(agent)[row], expected[:, agent - 1])
+            continue
+        exact = np.trace(expected[:, agent - 1], axis1=1, axis2=2)
+        error = np.asarray(p.standard_error("trace", agent))[row]
+        assert (np.abs(p.values("trace", agent)[row] - exact) <= 4.5 * error + 1e-9 * exact).all()
+
+
+def asked(estimator, engine):
+    sampled = {"runs": 600, "seed": 4, "workers": 1} if engine == "monte-carlo" else {}
+    return {"method": engine, "estimator": estimator, **sampled}
+
+
+@pytest.mark.parametrize(("estimator", "engine"), TAKEN)
+def test_cases_are_scenarios_of_their_own(estimator, engine):
+    source, links = one_state(31, 2, 1, 2, 2), {"calm": [[0, 0.7], [0.6, 0]], "storm": [[0, 0.3], [0.4, 0]]}
+    del source["network"]["link"]
+    cases = [{"name": name, "link": link} for name, link in links.items()]
+    both = sf.Scenario.from_mapping({**source, "network": {**source["network"], "case": cases}})
+    p = sf.predict(both, **asked(estimator, engine))
+    for row, link in enumerate(links.values()):
+        alone = {**source, "network": {**source["network"], "link": link}}
+        agrees(p, row, textbook_estimators.expected(alone, estimator)["claimed"])
+
+
+BURSTY = one_state(32, 2, 1, 2, 2)
+del BURSTY["network"]["link"]
+CHAIN = {"good_to_bad": 0.3, "bad_to_good": 0.4, "good": 0.9, "bad": 0.2}
+
+
+@cache
+def with_bursts(estimator):
+    """Claims over every way in which the two links can be good and bad, each a scenario with links by step."""
+    total, start, stay = 0.0, np.array([4 / 7, 3 / 7]), np.array([[0.7, 0.3], [0.4, 0.6]])
+    for one, other in product(product((0, 1), repeat=2), repeat=2):
+        probability = start[one[0]] * stay[one] * start[other[0]] * stay[other]
+        link = [[[0, (0.9, 0.2)[a]], [(0.9, 0.2)[b], 0]] for a, b in zip(one, other, strict=True)]
+        way = {**BURSTY, "network": {**BURSTY["network"], "link": link}}
+        total = total + probability * textbook_estimators.expected(way, estimator)["claimed"]
+    return total
+
+
+@pytest.mark.parametrize(("estimator", "engine"), TAKEN)
+def test_bursts_are_links_that_change_by_chance(estimator, engine):
+    bursty = {**BURSTY, "network": {**BURSTY["network"], "burst": CHAIN}}
+    agrees(sf.predict(sf.Scenario.from_mapping(bursty), **asked(estimator, engine)), 0, with_bursts(estimator))
 
 
 def moments(source, link, estimator, method="general"):

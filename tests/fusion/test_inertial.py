@@ -191,15 +191,15 @@ def test_the_nominal_sensors_reproduce_the_nominal_way(flown):
 
 
 def test_composed_transition_carries_the_errors_of_a_nonlinear_mechanisation(flown):
-    model = error_model(flown, NO_BIAS_DECAY, SMALL, 21, 100)
+    model = error_model(flown, NO_BIAS_DECAY, SMALL, 11, 100)
     Phi = np.linalg.multi_dot(model.F[:0:-1])
     rng = np.random.default_rng(5)
-    true = integrate(nominal(flown, 0), flown, 2000, 0, 0)
+    true = integrate(nominal(flown, 0), flown, 1000, 0, 0)
     for block in range(5):  # one kind of error at a time, so that none hides another
         x = np.zeros(15)
         x[3 * block : 3 * block + 3] = rng.normal(size=3) * [1e-4, 0.1, 10, 1e-6, 1e-3][block]
         ends = [
-            integrate(displaced(nominal(flown, 0), sign * x), flown, 2000, sign * x[9:12], sign * x[12:])
+            integrate(displaced(nominal(flown, 0), sign * x), flown, 1000, sign * x[9:12], sign * x[12:])
             for sign in (1, -1)
         ]
         found = 0.5 * (errors(ends[0], true) - errors(ends[1], true))

@@ -77,8 +77,13 @@ class Truth:
         self.related = self._relations(source.get("cooperative"), tables, model.get("states"))
         self.link = self._link(network)
         delay = network.get("delay", [1.0])
-        self.delay = tuple(delay) if isinstance(delay, list) else (*[0.0] * delay, 1.0)
+        unequal = isinstance(delay, list) and isinstance(delay[0], list)
+        self.delay = [list(map(self._spread, row)) for row in delay] if unequal else self._spread(delay)
         self._lay_out()
+
+    @staticmethod
+    def _spread(delay):
+        return tuple(delay) if isinstance(delay, list) else (*[0.0] * delay, 1.0)
 
     def _link(self, network):
         link = np.array(network["link"], float)
@@ -456,7 +461,7 @@ class Lwin(Rule):
             Hi, Hj, R = t.related[i, j][k - 1] if t.own else (np.eye(d), -np.eye(d), np.zeros((d, d)))
             s = t.rows(("s", k, (i, j)), slice(0, len(R))) if t.own else 0.0
             noise = Hj @ now[j].P @ Hj.T + R
-            K = P @ Hi.T @ np.linalg.inv(Hi @ P @ Hi.T + noise)
+            K = P @ Hi.T @ np.linalg.pinv(Hi @ P @ Hi.T + noise, rcond=1e-11, hermitian=True)
             P, e = (np.eye(d) - K @ Hi) @ P, e + K @ (s - Hj @ now[j].e - Hi @ e)
         return Local(P, e, 0)
 
@@ -517,8 +522,108 @@ RULES = {
 }
 
 
+# ---------------------------------------------------------------------------------------------- what pedigrees tell
+
+
+class Graph:
+    """One history with the Local Fusion Graph as the thesis tells it, sets of nodes and inverses; or naively."""
+
+    naive = False
+
+    def __init__(self, t, history):
+        self.t = t
+        starts = [self.pair(t.first(i)) for i in range(t.n)]
+        self.locals, self.fused = {"root": starts[0]}, {}
+        parents: dict[Any, set[Any]] = {(i, 1): ({"root"} if t.shared else set()) for i in range(t.n)}
+        graph = textbook.FusionGraph(parents, lambda node: self.locals[node], self.forward)
+        for k, messages in enumerate(history, start=1):
+            for i in range(t.n):
+                self.locals[i, k] = starts[i] if k == 1 else self.measure(self.forward(self.fused[i, k - 1], k), i, k)
+            for i in range(t.n):
+                received = {(i, k)} | {(j, sent) for j, receiver, sent in messages if receiver == i}
+                if self.naive:
+                    pairs = [graph.bring(self.locals[node], node[1], k) for node in sorted(received)]
+                    self.fused[i, k] = sum(y for y, _ in pairs), sum(Y for _, Y in pairs)
+                else:
+                    self.fused[i, k] = graph.info(graph.maximal(received), k)
+                parents[i, k + 1] = set(received)
+
+    @staticmethod
+    def pair(one):
+        Y = np.linalg.inv(one.P)
+        return Y @ one.e, Y
+
+    @staticmethod
+    def local(pair):
+        P = np.linalg.inv(pair[1])
+        return Local(P, P @ pair[0])
+
+    def forward(self, pair, k):
+        return self.pair(self.t.forward(0, k, self.local(pair)))
+
+    def measure(self, pair, i, k):
+        H, R = at(self.t.H[i], k), at(self.t.R[i], k)
+        G = H.T @ np.linalg.inv(R)
+        return pair[0] + G @ self.t.rows(("w", k), self.t.z[i]), pair[1] + G @ H
+
+    def shown(self, i, k):
+        return self.local(self.fused[i, k])[:2]
+
+
+class Naive(Graph):
+    naive = True
+
+
+class Best:
+    """One history with the best linear unbiased estimate from every first estimate and measurement in the pedigree."""
+
+    def __init__(self, t, history):
+        self.t, self.known, local = t, {}, {}
+        for k, messages in enumerate(history, start=1):
+            for i in range(t.n):
+                own = {("start", 0 if t.shared else i)} if k == 1 else self.known[i, k - 1] | {(k, i)}
+                local[i, k] = frozenset(own)
+            for i in range(t.n):
+                heard = [local[j, sent] for j, receiver, sent in messages if receiver == i]
+                self.known[i, k] = local[i, k].union(*heard)
+
+    def shown(self, i, k):
+        t, d = self.t, len(self.t.P0s[0])
+        # the state as a linear function of the first one and of the noises since
+        of_first, of_noise = {1: np.eye(d)}, {1: np.zeros((d, t.width + 1))}
+        for m in range(2, k + 1):
+            F = at(t.F[0], m)
+            of_first[m], of_noise[m] = F @ of_first[m - 1], F @ of_noise[m - 1] + t.rows(("v", m), t.x[0])
+        A, N = [], []
+        for m, j in sorted(self.known[i, k], key=str):
+            H = np.eye(d) if m == "start" else at(t.H[j], m)
+            A.append(H @ of_first[1 if m == "start" else m])
+            N.append(t.first(j).e if m == "start" else H @ of_noise[m] + t.rows(("w", m), t.z[j]))
+        A, N, wanted = np.concatenate(A), np.concatenate(N), of_noise[k]
+        S, c = N[:, :-1] @ t.Sigma @ N[:, :-1].T, N[:, :-1] @ t.Sigma @ wanted[:, :-1].T
+        equations = np.block([[S, A], [A.T, np.zeros((d, d))]])
+        W = np.linalg.lstsq(equations, np.concatenate([c, of_first[k].T]), rcond=1e-13)[0][: len(S)].T
+        e = W @ N - wanted
+        return e[:, :-1] @ t.Sigma @ e[:, :-1].T, e
+
+
+PEDIGREES = {"local-fusion-graph": Graph, "naive": Naive, "optimal": Best}
+
+
+def of_pedigrees(source, name):
+    """The same as `of_histories`, of what the pedigrees tell: every whole history for itself."""
+    t = Truth(source)
+    for probability, history in textbook.histories(t.n, t.steps, t.architecture, t.link, t.delay):
+        network = PEDIGREES[name](t, history)
+        for k in range(1, t.steps + 1):
+            yield k, probability, [t.moments(*network.shown(i, k)) for i in range(t.n)]
+
+
 def of_histories(source, name):
     """(claimed, actual, bias, mean square) of every agent after each history, and its probability, step by step."""
+    if name in PEDIGREES:
+        yield from of_pedigrees(source, name)
+        return
     t = Truth(source)
     rule = RULES[name](t)
     likely = {}

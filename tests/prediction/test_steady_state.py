@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 
@@ -15,6 +15,7 @@ from tests.oracles.strategies import mapping, model, seeds
 LINKS = (0.0, 0.3, 1.0)
 
 
+@settings(max_examples=25)
 @given(seeds, st.integers(1, 4), st.integers(1, 5))
 def test_no_link_and_full_link_are_riccati_equations(seed, d, agents):
     rng = np.random.default_rng(seed)
