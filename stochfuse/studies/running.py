@@ -232,8 +232,8 @@ def _executor(given: Executor | None, workers: int) -> Iterator[tuple[Executor, 
         yield given, workers if workers > 1 else getattr(given, "_max_workers", None) or os.cpu_count() or 1
         return
     # a worker has one processor: more threads in its matrix products would only be in the others' way
-    changed = dict.fromkeys(THREADS, "1")
-    changed["PYTHONWARNINGS"] = ",".join(filter(None, (os.environ.get("PYTHONWARNINGS"), LEFT_BEHIND)))
+    warnings = ",".join(filter(None, (os.environ.get("PYTHONWARNINGS"), LEFT_BEHIND)))
+    changed: dict[str, str] = {**dict.fromkeys(THREADS, "1"), "PYTHONWARNINGS": warnings}
     before, others = {name: os.environ.get(name) for name in changed}, multiprocessing.active_children()
     os.environ.update(changed)
     pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"), initializer=_begin)
