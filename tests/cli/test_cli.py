@@ -536,6 +536,19 @@ def test_derive_general():
     assert strict_json(run("derive", "naive", "--step", "1", "--format", "json").stdout)["method"] == "naive"
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("predict", "--agent"), "error: agent: expected mean, worst, best or a number from 1 to 3, got '"),
+        (("messages", "--agent"), "error: agent: expected mean or a number from 1 to 3, got '"),
+        (("predict", "--at"), "error: --at: expected steps from 1 to 5, or last, got '"),
+    ],
+)
+@pytest.mark.parametrize("number", ["²", "½", "9" * 5000, "0", "-1"])
+def test_what_looks_like_a_number_and_is_none_of_ours(words, message, number):
+    assert run(*words, number, code=2).stderr == f"{message}{number}'\n"
+
+
 @pytest.mark.slow
 def test_reproduce_timing():
     rows = strict_json(run("reproduce", "timing", "--format", "json").stdout)["rows"]

@@ -227,69 +227,76 @@ def options() -> dict[str, tuple[Flag, ...]]:
 
 
 def value(pick: random.Random, command: str, flag: str) -> str:
-    return pick.choice(OWN.get((command, flag), VALUES[flag]))
+    return pick.choice(OWN.get((command, flag), VALUES.get(flag, WRONG)))
 
 
 def line(pick: random.Random) -> list[list[str]]:
     """A command line: its command, and one list of words for whatever else it has."""
-    names = list(options())
-    command = pick.choices(names, [WEIGHTS.get(name, 1) for name in names])[0]
+    command = pick.choices(list(options()), [WEIGHTS.get(name, 1) for name in options()])[0]
     words: list[list[str]] = []
     if command in ARGUMENTS and (command in ("crosscheck", "links", "study") or pick.random() < 0.6):
         words.append([pick.choice(ARGUMENTS[command])])
     if command == "crosscheck" and pick.random() < 0.3:
         words.append([pick.choice(SCENARIOS)])
-    have = options()[command]
-    drawn = pick.sample(have, min(len(have), pick.choice((0, 1, 1, 2, 2, 3, 3, 5))))
-    drawn = [flag for flag in drawn if pick.random() < SELDOM.get(flag.name, 1)]
-    if command == "solve" and pick.random() < 0.95:
-        drawn = [flag for flag in drawn if flag.name not in QUESTIONS]
-        drawn += [Flag(name, name == "--target") for name in pick.choice(QUESTIONS_ASKED)]
+    drawn = flags(pick, command)
     if command in ("predict", "compare", "messages") and pick.random() < 0.9:
         methods = [FOR[flag.name] for flag in drawn if flag.name in FOR]
         method = "--methods" if command == "compare" else "--method"
         drawn = [flag for flag in drawn if flag.name != method or not methods]
         words += [[method, "monte-carlo" if command == "messages" else methods[0]]] if methods else []
-    words += [
-        [flag.name, value(pick, command, flag.name)] if flag.takes or flag.name == "--over" else [flag.name]
-        for flag in drawn
-        if flag.name != "--dask"
-    ]
-    names, text = {flag.name for flag in drawn}, str(words)
-    for flag, small in SMALL.items():
-        unasked = (flag == "--runs" and "monte-carlo" not in text and command != "compare") or (
-            flag == "--max-graphs" and "general" not in text
-        )
-        unasked |= flag == "--agents" and any(
-            name in text for name in ("agents", ".toml", "two-radars", "filters", "pnt")
-        )
-        unasked |= flag == "--link" and any(name in text for name in ("'--target']", "critical", "network.link"))
-        if (
-            Flag(flag, True) in have
-            and not unasked
-            and flag not in names
-            and pick.random() < (0.3 if flag == "--link" else 0.9)
-        ):
-            words.append([flag, OWN.get((command, flag), (small,))[0]])
-    if pick.random() < 0.4 and Flag("--format", True) in have and "--format" not in names:
+    words += [[flag.name, value(pick, command, flag.name)] if flag.takes else [flag.name] for flag in drawn]
+    words += shortening(pick, command, words)
+    if (
+        pick.random() < 0.4
+        and Flag("--format", True) in options()[command]
+        and ["--format"] not in [w[:1] for w in words]
+    ):
         words.append(["--format", "json"])
-    if words and pick.random() < 0.3:
+    return [command.split(), *mistaken(pick, words)]
+
+
+def flags(pick: random.Random, command: str) -> list[Flag]:
+    """Some options of a command, and of `solve` most of the time a question."""
+    have = options()[command]
+    drawn = pick.sample(have, min(len(have), pick.choice((0, 1, 1, 2, 2, 3, 3, 5))))
+    drawn = [flag for flag in drawn if flag.name != "--dask" and pick.random() < SELDOM.get(flag.name, 1)]
+    if command == "solve" and pick.random() < 0.95:
+        drawn = [flag for flag in drawn if flag.name not in QUESTIONS]
+        drawn += [Flag(name, name in ("--target", "--over")) for name in pick.choice(QUESTIONS_ASKED)]
+    return drawn
+
+
+def shortening(pick: random.Random, command: str, words: Sequence[Sequence[str]]) -> list[list[str]]:
+    """What most of the time keeps the work small."""
+    text, found = str(words), []
+    sampled = "monte-carlo" in text or (command == "compare" and "--methods" not in text)
+    idle = {"--runs": not sampled, "--max-graphs": "general" not in text}
+    idle["--agents"] = any(name in text for name in ("agents", ".toml", "two-radars", "filters", "pnt"))
+    idle["--link"] = any(name in text for name in ("'--target']", "critical", "network.link")) or pick.random() < 0.7
+    for flag, small in SMALL.items():
+        asked = Flag(flag, True) not in options()[command] or any(word[0] == flag for word in words)
+        if not asked and not idle.get(flag) and pick.random() < 0.9:
+            found.append([flag, OWN.get((command, flag), (small,))[0]])
+    return found
+
+
+def mistaken(pick: random.Random, words: list[list[str]]) -> list[list[str]]:
+    """The words, now and then with a wrong value, or with another mistake of typing."""
+    words = list(words)
+    if words and pick.random() < 0.25:
         at = pick.choice([i for i, word in enumerate(words) if word[0] not in SMALL] or [0])
         words[at] = [*words[at][:-1], pick.choice(WRONG)]
-    if pick.random() < 0.05:
-        mistake = pick.choice(("forgotten", "unknown", "twice", "stray", "glued"))
-        at = pick.randrange(len(words)) if words else 0
-        if mistake == "unknown":
-            words.append([pick.choice(("--stepz", "-x", "--link-", "---", "--no-plot"))])
-        elif mistake == "stray":
-            words.insert(at, [pick.choice(WRONG)])
-        elif words and mistake == "forgotten":
-            words[at] = words[at][:1]
-        elif words and mistake == "twice":
-            words.append(words[at])
-        elif words:
-            words[at] = ["=".join(words[at])]
-    return [command.split(), *words]
+    if pick.random() > 0.05:
+        return words
+    mistake, at = pick.choice(("forgotten", "unknown", "twice", "stray", "glued")), pick.randrange(len(words) or 1)
+    if mistake == "unknown":
+        words.append([pick.choice(("--stepz", "-x", "--link-", "---", "--no-plot"))])
+    elif mistake == "stray":
+        words.insert(at, [pick.choice(WRONG)])
+    elif words:
+        one = words[at]
+        words[at : at + 1] = {"forgotten": [one[:1]], "twice": [one, one], "glued": [["=".join(one)]]}[mistake]
+    return words
 
 
 class Failure(NamedTuple):
@@ -403,8 +410,8 @@ def check(failures: dict[tuple[str, str], str], codes: Counter[int]) -> None:
         told = "\n\n".join(failures.values())
         pytest.fail(f"{len(failures)} distinct failures, {dict(codes)}:\n\n{told}", pytrace=False)
     total = codes.total()
-    assert codes[0] > 0.3 * total, codes
-    assert codes[2] > 0.2 * total, codes
+    assert codes[0] > 0.25 * total, codes
+    assert codes[2] > 0.25 * total, codes
     assert codes[3] > 0, codes
 
 

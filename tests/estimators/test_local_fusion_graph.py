@@ -301,6 +301,15 @@ def test_bad_histories(source, message):
         History.from_mapping(source)
 
 
+def test_a_graph_needs_agents_that_track_one_state():
+    graph = FusionGraph(load_history("thesis-example"))
+    parallel = sf.load_scenario("parallel-filters", agents=3, steps=4, uniform_link=True)
+    with pytest.raises(
+        sf.UsageError, match=r"estimator local-fusion-graph: expected one model for all agents, got par"
+    ):
+        graph.estimates(parallel)
+
+
 def test_requests_outside_a_history(example):
     graph = example[0]
     with pytest.raises(sf.UsageError, match="agent: expected a whole number from 1 to 3, got 4"):

@@ -281,6 +281,11 @@ def test_presets_pass_the_check_that_their_loading_skips_and_survive_json(name, 
     np.testing.assert_array_equal(sf.predict(again.until(few)).covariance, sf.predict(loaded.until(few)).covariance)
 
 
+def test_a_name_that_cannot_be_printed_is_told_in_one_line():
+    with pytest.raises(sf.ScenarioError, match=r"^'a\\nb': no such file, and no preset of that name"):
+        sf.load_scenario("a\nb")
+
+
 def test_overrides_take_the_place_of_keys():
     s = sf.load_scenario("thesis-transient", agents=5, steps=7, architecture="cyclic", q=1.0, r=2.0, p0=3.0)
     assert (s.network.agents, s.network.steps, s.network.architecture) == (5, 7, "cyclic")
