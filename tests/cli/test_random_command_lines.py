@@ -36,7 +36,7 @@ from tests.agreement.test_random_walk import limited
 from tests.cli.command import ENV, strict_json
 
 SEED = int(os.environ.get("STOCHFUSE_LINES_SEED", "1"))
-LINES = int(os.environ.get("STOCHFUSE_LINES", "2500"))
+LINES = int(os.environ.get("STOCHFUSE_LINES", "2000"))
 QUICK = 300
 LIMIT = 15.0
 """Seconds of processor time that a line of this size may take."""
