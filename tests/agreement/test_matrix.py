@@ -50,6 +50,8 @@ NETWORKS = {
     "cyclic, delays": Case("cyclic", 3, 2, delay=(0.7, 0.3)),
     "one agent": Case("ad-hoc", 1, 3),
 }  # fmt: skip
+LONG = ("ad hoc", "ad hoc, delays")
+"""Networks with thousands of histories; two agents for three steps, unequal links and unequal delays are there too."""
 ESTIMATORS = ("local-fusion-graph", "naive")
 
 
@@ -121,7 +123,9 @@ def by_agent(found, values):
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("engine", ["merged", "plain", "states", "monte-carlo"])
-@pytest.mark.parametrize("network", NETWORKS)
+@pytest.mark.parametrize(
+    "network", [pytest.param(name, marks=pytest.mark.slow) if name in LONG else name for name in NETWORKS]
+)
 def test_agreement(network, engine, estimator):
     case, scenario, pieces = given(network)
     P, x = oracle(network, estimator)

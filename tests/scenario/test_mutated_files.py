@@ -24,7 +24,7 @@ from stochfuse.studies.evaluation import evaluate
 from stochfuse.studies.files import Columns
 from stochfuse.studies.reading import load_study
 
-FEW, MANY = 120, 700
+FEW, MANY = 80, 700
 """Examples of a test; two tests each for scenarios and studies."""
 MOST_STEPS, MOST_AGENTS = 4, 6
 """What is predicted is cut to that: a scenario may be right and long."""

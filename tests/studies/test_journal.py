@@ -421,7 +421,7 @@ def test_all_writes_are_among_the_faults(name, tmp_path, small_chunks):
     ("name", "stays"),
     [
         ("result.csv", True),
-        ("result.parquet", False),
+        pytest.param("result.parquet", False, marks=pytest.mark.slow),
         pytest.param("result.csv", False, marks=pytest.mark.slow),
         pytest.param("result.parquet", True, marks=pytest.mark.slow),
     ],

@@ -380,6 +380,7 @@ def test_a_chunk_that_kills_its_worker_every_time_is_named(tmp_path, few, monkey
     assert output.read_bytes() == few
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_once_is_replaced(tmp_path, few, monkeypatch):
     monkeypatch.setenv("STOCHFUSE_TEST_DIED", str(tmp_path / "died"))
     monkeypatch.setattr(running, "ProcessPoolExecutor", Handing(dies_once, ProcessPoolExecutor))

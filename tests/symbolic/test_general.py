@@ -133,6 +133,10 @@ def test_forms_that_would_fill_books_are_refused():
         derive_general(3, 3).closed()
     with pytest.raises(sf.UsageError, match="too many for a closed form: give fewer steps"):
         derive_general(3, 5, 25, 100, 100, architecture="cyclic").closed()
+
+
+@pytest.mark.slow
+def test_outcomes_too_many_for_an_exact_form_are_refused():
     with pytest.raises(
         sf.UsageError, match="step 3 of 5 agents has too many outcomes for an exact form: give fewer agents"
     ):
