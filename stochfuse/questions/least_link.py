@@ -35,7 +35,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from math import comb, isfinite, log
+from math import comb, inf, isfinite, log
 from typing import Any, NamedTuple
 
 import mpmath
@@ -119,7 +119,9 @@ def _interpolated(value: Function, target: float, a: float, b: float, *, rises: 
 
     def beyond(x: float) -> float:
         y = float(value(np.array([x]))[0])
-        return log(y / target) if y > 0 and target > 0 and y != target else y - target
+        ratio = y / target if target > 0 else 0.0
+        # next to the target the ratio may be rounded to 1, which the difference never is to 0
+        return log(ratio) if 0 < ratio < inf and ratio != 1 else y - target
 
     fa, fb = beyond(a), beyond(b)
     whole, most = b - a, (b - a) * 2.0**SPARE

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -368,7 +369,8 @@ def test_a_full_or_closed_standard_output_is_a_failure_in_one_line(command):
 def test_a_closed_pipe_is_quiet():
     command = f"{sys.executable} -m stochfuse predict --link 0:1:0.002 --format csv | head -1"
     done = subprocess.run(["bash", "-o", "pipefail", "-c", command], capture_output=True, text=True, env=ENV)
-    assert (done.returncode, done.stderr) == (0, "")
+    # a machine that has much else to do is told that it takes a while
+    assert (done.returncode, re.sub(r"note: .* so far\n", "", done.stderr)) == (0, "")
     assert done.stdout.startswith("method,")
 
 
