@@ -162,6 +162,7 @@ class _Block:
         readings = Readings.given(system, still, first=[start[None]] * system.agents)
         self.system, self.functions, self.generator = system, functions, generator
         self.world: World = readings.world
+        self._roots: dict[bytes, np.ndarray] = {}
         self.start, self.inputs, self.shifts = readings.x0, readings.inputs, readings.shifts
 
     def drawn(
@@ -205,4 +206,7 @@ class _Block:
 
     def _noise(self, covariance: np.ndarray) -> np.ndarray:
         """A draw for each run of the block, (runs, …, 1)."""
-        return factor(covariance) @ self.generator.standard_normal((BLOCK, len(covariance), 1))
+        key = covariance.tobytes()
+        if key not in self._roots:  # most are the same at every step
+            self._roots[key] = factor(covariance)
+        return self._roots[key] @ self.generator.standard_normal((BLOCK, len(covariance), 1))

@@ -35,12 +35,12 @@ from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.result import Result
 from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario
 
-FAR = 60
-"""Steps up to which errors are predicted one by one."""
-STEADY = 1e-4
-"""Largest relative change of a prediction in a step that is taken for steady."""
-FOLLOWED = 20_000
-"""Runs times steps times agents of which the error given what arrived is worked out."""
+FAR, LAST = 40, 10
+"""Steps up to which errors are predicted one by one, and how many of the last are averaged for a steady one."""
+STEADY = 0.02
+"""Largest relative change of such an average over as many steps that is taken for steady."""
+FOLLOWED = 2_000_000
+"""Runs times agents times steps squared of which the error given what arrived is worked out: so does its work grow."""
 
 
 class RecordsLike(Protocol):
@@ -412,7 +412,7 @@ class Tally:
     def _add_given(self, arrivals: Arrivals) -> None:
         """Expected squared error given what arrived, of as many runs as can be followed."""
         system = self.records.scenario.system
-        left = FOLLOWED // (system.steps * system.agents) - self._given_count
+        left = FOLLOWED // (system.steps**2 * system.agents) - self._given_count
         if left < 1 or self._given_count < 0:
             if self._given_count >= 0:
                 self.notes.append(
@@ -521,8 +521,9 @@ def _expected(scenario: Scenario, links: LinkRows | None, estimator: str, way: W
     square = found.moments.square[0][:, found.group_of]
     method = f"{registry.engine_of(found.method).name}, {found.nature}"
     if system.steps > FAR:
-        change = np.abs(square[-1] - square[-2]).max() / np.abs(square[-1]).max()
-        if change > STEADY:
+        # what was sampled changes by chance from step to step, and less so its average over some steps
+        last, before = square[-LAST:].mean(axis=0), square[-2 * LAST : -LAST].mean(axis=0)
+        if np.abs(last - before).max() > STEADY * np.abs(last).max():
             return nothing(f"the error is not steady at step {FAR}")
-        square = np.concatenate([square, np.broadcast_to(square[-1], (system.steps - FAR, *square.shape[1:]))])
+        square = np.concatenate([square, np.broadcast_to(last, (system.steps - FAR, *square.shape[1:]))])
     return Expected(square, method, ())

@@ -362,7 +362,8 @@ class SumNumbers:
         todo = _closed(self.pairs.unknown(self.pairs.key(values, runs)), self._resting, self.pairs)
         if not len(todo):
             return
-        step_of = np.array(self._ledger.step)[todo // self.pairs.runs]
+        used, which = np.unique(todo // self.pairs.runs, return_inverse=True)
+        step_of = np.array([self._ledger.step[value] for value in used.tolist()])[which]
         for step in np.unique(step_of).tolist():
             keys = todo[step_of == step]
             packed = self._sums(keys, step)
