@@ -102,13 +102,6 @@ def part(results, first, last):
     return replace(results, **columns)
 
 
-def part(results, first, last):
-    """Some of the runs."""
-    some = (results.run >= first) & (results.run < last)
-    columns = {name: getattr(results, name)[some] for name in ("link", "step", "agent", "covariance", "run", "line")}
-    return replace(results, **columns)
-
-
 @pytest.mark.parametrize(
     ("architecture", "agents", "link", "runs"),
     [("ad-hoc", 3, 0.98, 2), ("ad-hoc", 2, 0.98, 200), ("broadcast", 2, 0.02, 200), ("ad-hoc", 3, 0.005, 100), ("cyclic", 3, 0.99, 20)],
