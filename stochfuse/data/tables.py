@@ -107,7 +107,7 @@ def opened(source: Any, stack: ExitStack) -> Table:
     path = Path(source)
     try:
         stream = stack.enter_context(path.open("rb"))
-        return _of_parquet(path, stream) if path.suffix.lower() in SUFFIXES else _of_bytes(str(path), stream)
+        return _of_parquet(path, stack) if path.suffix.lower() in SUFFIXES else _of_bytes(str(path), stream)
     except FileNotFoundError:
         raise ColumnsError(f"{path}: no such file") from None
     except OSError as error:
@@ -259,7 +259,7 @@ def _arrow(module: str) -> Any:
 
 
 def _by_arrow(text: bytes, width: int, separator: str, kinds: Mapping[int, str]) -> Callable[[int, str], Any] | None:
-    """The wanted columns by pyarrow, or None where it does not take them."""
+    """The wanted columns by pyarrow, or None where it does not take them; without threads, since engines fork."""
     pa, pa_csv = _arrow("pyarrow"), _arrow("pyarrow.csv")
     if pa is None or pa_csv is None or not kinds:
         return None
@@ -268,7 +268,9 @@ def _by_arrow(text: bytes, width: int, separator: str, kinds: Mapping[int, str])
     try:
         table = pa_csv.read_csv(
             pa.BufferReader(text),
-            read_options=pa_csv.ReadOptions(column_names=[str(i) for i in range(width)], block_size=len(text) + 1),
+            read_options=pa_csv.ReadOptions(
+                use_threads=False, column_names=[str(i) for i in range(width)], block_size=len(text) + 1
+            ),
             parse_options=pa_csv.ParseOptions(delimiter=separator),
             convert_options=pa_csv.ConvertOptions(
                 column_types=types, include_columns=list(types), null_values=[""], strings_can_be_null=True
@@ -312,18 +314,18 @@ def _in_order(labels: Labels) -> Labels:
 # Parquet, JSON, arrays
 
 
-def _of_parquet(path: Path, stream: IO[bytes]) -> Table:
+def _of_parquet(path: Path, stack: ExitStack) -> Table:
     needed("pyarrow.parquet", "study", f"{path}: Parquet needs")
     pq, pa = import_module("pyarrow.parquet"), import_module("pyarrow")
     try:
-        file = pq.ParquetFile(stream)
+        file = stack.enter_context(pq.ParquetFile(path, pre_buffer=False))
     except (pa.ArrowInvalid, OSError) as error:
         raise ColumnsError(f"{path}: not a Parquet file: {str(error).splitlines()[0]}") from None
     header = tuple(file.schema_arrow.names)
 
     def parts(kinds: Mapping[int, str]) -> Iterator[Raw]:
         done, wanted = 0, [header[place] for place in kinds]
-        for batch in file.iter_batches(BATCH, columns=wanted):
+        for batch in file.iter_batches(BATCH, columns=wanted, use_threads=False):
             yield Raw(
                 batch.num_rows,
                 lambda place, kind, batch=batch: _of_arrow(batch.column(header[place]), kind),
