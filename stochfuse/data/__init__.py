@@ -4,6 +4,9 @@ One record of measurements and arrivals is one outcome.  `run` puts it through t
 average over chance (`stochfuse.engines.replay`), `simulate` draws such records, and `crosscheck` lays a simulator's
 results beside the prediction and says what would explain a difference.
 
+    records, writing          the files of a run, read and written
+    run, consistency          estimators on records; are they as good as they claim
+    draw, simulate            records that chance decides
     tables, columns           a table from wherever it is, as NumPy columns; what is wrong by line and column
     results                   what a simulator found
     expected                  what its values are distributed like

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -306,7 +306,7 @@ def _lengthened(scenario: Scenario, last: int, tables: Mapping[str, _Given]) -> 
         return scenario.until(last)
     source = scenario.to_mapping()
     try:
-        return load_scenario({**source, "network": {**source["network"], "steps": last}})
+        longer = load_scenario({**source, "network": {**source["network"], "steps": last}})
     except StochfuseError as error:
         table = max(tables.values(), key=lambda table: table.last)
         row = int(table.where[:, 0].argmax())
@@ -314,6 +314,7 @@ def _lengthened(scenario: Scenario, last: int, tables: Mapping[str, _Given]) -> 
             f"{table.columns.at(row, 'step')}: expected at most the scenario's {steps} steps, got {last}; it cannot be "
             f"lengthened: {error}"
         ) from None
+    return replace(longer, name=scenario.name)
 
 
 def _runs(tables: Mapping[str, _Given]) -> tuple[str, ...]:
