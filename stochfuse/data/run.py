@@ -341,15 +341,7 @@ def _heard(arrivals: Arrivals) -> np.ndarray:
 def stages(records: RecordsLike, batch: Batch, arrivals: Arrivals, estimator: str, criterion: str) -> Iterator[Stage]:
     """Follow an estimator through a batch of records; extended where sensors are by name."""
     scenario = records.scenario
-    functions = scenario.instruments
-    entry = registry.estimator(estimator)
-    if any(f is not None for f in functions) and entry.place[0] in ("blender", "equivalent"):
-        what = "the joint covariance of all filters" if entry.place[0] == "blender" else "the equivalent measurement"
-        raise UsageError(
-            f"estimator {estimator}: {what} is known beforehand only for linear sensors; expected sensors of H and R "
-            "where it runs on data, got sensors by name"
-        )
-    readings = Readings.given(scenario.system, batch.z, batch.relations, functions, batch.first)
+    readings = Readings.given(scenario.system, batch.z, batch.relations, scenario.instruments, batch.first)
     return replay(scenario.system, estimator, arrivals, readings, criterion)
 
 

@@ -99,7 +99,7 @@ def replay(
     NoAnswerError
         If in some run the estimator claims no covariance.
     """
-    require(system, name, arrivals)
+    require(system, name, arrivals, any(f is not None for f in readings.functions))
     estimator = make_for_data(system, name, criterion)
     numbers = numbers_of(estimator, system, readings, arrivals.runs)
     states, state_of = [estimator.start()], np.zeros(arrivals.runs, dtype=np.int64)
@@ -218,16 +218,19 @@ def moments_given(system: System, name: str, arrivals: Arrivals, criterion: str 
     return Moments(*(None if part[0] is None else np.stack(part, axis=1) for part in zip(*stages, strict=True)))  # pyright: ignore[reportArgumentType]
 
 
-def require(system: System, name: str, arrivals: Arrivals) -> None:
-    """Raise UsageError if an estimator does not take a system, or what a record has that the system need not have."""
+def require(system: System, name: str, arrivals: Arrivals, extended: bool = False) -> None:
+    """Raise UsageError if an estimator does not take a system, or a record of it.
+
+    Parameters
+    ----------
+    extended : whether sensors are linearised about estimates.
+    """
     capabilities.require(system, default_rows(system.network), name, GENERAL)
-    has = []
-    if arrivals.late:
-        has.append("delay")
+    has = [capabilities.LATE] if arrivals.late else []
+    if extended:
+        has.append(capabilities.BY_NAME)
     if any(mask for run in arrivals.missed for mask in run[1:]):
-        has.append("detection")
-    for feature in has:
-        why = capabilities.reason(name, GENERAL, feature)
-        if why is not None:
-            what = "messages that came late" if feature == "delay" else "measurements that are missing"
-            raise UsageError(f"the record has {what}: {why}")
+        has.append(capabilities.GAPS)
+    why = capabilities.not_on_data(name, has)
+    if why is not None:
+        raise UsageError(why)

@@ -48,6 +48,14 @@ TERMS = {
         "claim is true; more where it is overconfident."
     ),
     "NIS": "Normalised innovation squared, the same of the innovation; needs no truth.",
+    "realised": (
+        "What an estimator's error came to on data, x̂ less the truth: a sample, to be laid beside what is predicted, "
+        "over noises and arrivals, or given these very arrivals. See stochfuse run and simulate."
+    ),
+    "replay": (
+        "One record of what arrived and what was measured, followed step by step by the same estimators that other "
+        "engines average."
+    ),
     "mean field": "See approximate.",
     "ad-hoc": "Every message reaches each agent that could hear it, or not, independently of the others.",
     "broadcast": "A message reaches everyone, or no one.",

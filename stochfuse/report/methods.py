@@ -25,6 +25,8 @@ def methods_table(*, matrix: bool = False) -> Table:
 def _listing_table() -> Table:
     rows = [("estimator", e.name, f"{e.title} ({e.source})") for e in registry.ESTIMATOR]
     rows += [("method", e.name, f"{e.title}, {e.source}: {e.help}; {e.nature}") for e in registry.ENGINE]
+    e = registry.REPLAY
+    rows += [("engine", e.name, f"{e.source}: {e.help}; {e.nature}")]
     rows += [("method", s.name, f"short for --estimator {s.estimator} --method {s.engine}") for s in registry.SHORT]
     rows += [("quantity", q.name, q.help) for q in registry.QUANTITY]
     rows += [("metric", m.name, m.help) for m in registry.METRIC]
@@ -70,7 +72,7 @@ def methods_json() -> dict[str, Any]:
         "estimators": [{"name": e.name, "title": e.title, "source": e.source} for e in registry.ESTIMATOR],
         "engines": [
             {"name": e.name, "title": e.title, "source": e.source, "nature": e.nature, "help": e.help}
-            for e in registry.ENGINE
+            for e in (*registry.ENGINE, registry.REPLAY)
         ],
         "short_forms": [{"name": s.name, "estimator": s.estimator, "engine": s.engine} for s in registry.SHORT],
         "quantities": [{"name": q.name, "help": q.help} for q in registry.QUANTITY],

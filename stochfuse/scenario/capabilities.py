@@ -289,6 +289,29 @@ def require(system: System, links: LinkRows, estimator: str, engine: str) -> Non
                 raise UsageError(f"{rule.who.format(estimator=estimator)}: {rule.why}{instead}")
 
 
+LATE, GAPS, BY_NAME = "messages that came late", "measurements that are missing", "sensors by name"
+"""What a record may have that its scenario need not have, or that counts only on data."""
+_AS_FEATURE = {LATE: "delay", GAPS: "detection"}
+_KNOWN_BEFORE = {"blender": "the joint covariance of all filters", "equivalent": "the equivalent measurement"}
+
+
+def not_on_data(estimator: str, has: Sequence[str]) -> str | None:
+    """Why an estimator does not run on a record that has some of `LATE`, `GAPS`, `BY_NAME`; None if it does."""
+    for what in has:
+        if what in _AS_FEATURE:
+            why = reason(estimator, GENERAL, _AS_FEATURE[what])
+            if why is not None:
+                return f"the record has {what}: {why}"
+        known = _KNOWN_BEFORE.get(registry.estimator(estimator).place[0])
+        if what == BY_NAME and known is not None:
+            takes = [e.name for e in registry.ESTIMATOR if e.place[0] not in _KNOWN_BEFORE and not e.own_states]
+            return (
+                f"estimator {estimator}: {known} is known beforehand only of linear sensors; expected sensors of H and "
+                f"R where it runs on data, got {what}; {', '.join(takes)} take them"
+            )
+    return None
+
+
 def matrix() -> dict[str, dict[str, dict[str, bool | str]]]:
     """Return the whole table: estimator, engine, feature → True or the reason."""
     names = [feature.name for feature in FEATURES]

@@ -241,6 +241,15 @@ ENGINE = (
         "sampled",
     ),
 )
+REPLAY = EngineEntry(
+    "replay",
+    "replay",
+    "one outcome of (45)/(46), with what was measured",
+    "realised",
+    "follow one record of what arrived: run, simulate",
+    "",
+)
+"""The engine that averages nothing, and is no --method."""
 SHORT = (Short(NAIVE, NAIVE, GENERAL), Short(OPTIMAL, OPTIMAL, CHAIN))
 QUANTITY = (
     Quantity("claimed", "claimed {stage} covariance", "what the fusion rule itself reports", False),
