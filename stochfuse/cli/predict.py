@@ -50,7 +50,7 @@ def predict(
     quantity: QuantityOption = "claimed",
     measurements: Annotated[
         str | None,
-        option("With --quantity state: CSV, Parquet or -: step, agent, z1, z2, …", SHOWN, metavar="FILE"),
+        option("With --quantity state: CSV, Parquet or -: step, agent, z1, z2, …", SHOWN + RARE, metavar="FILE"),
     ] = None,
     metric: MetricOption = None,
     statistic: Annotated[

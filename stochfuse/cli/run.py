@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from stochfuse.data.run import RunResult
 
 EXAMPLES = (
-    "stochfuse run my.toml --measurements z.csv --arrivals heard.csv --truth truth.csv",
-    "stochfuse run thesis-steady --measurements z.csv --link 0.5 --estimator naive,optimal",
+    "stochfuse run my.toml --measurements z.csv --arrivals heard.csv --truth x.csv",
+    "stochfuse run my.toml --measurements z.csv --link 0.5 --estimator optimal",
 )
 EstimatorsOption = Annotated[
     str,

@@ -26,8 +26,8 @@ from stochfuse.errors import UsageError
 from stochfuse.scenario.registry import LFG
 
 EXAMPLES = (
-    "stochfuse simulate thesis-steady --link 0.5 --runs 200 --seed 1 --output folder",
-    "stochfuse simulate two-radars --link 0.5 --runs 50 --estimator local-fusion-graph,stand-alone",
+    "stochfuse simulate thesis-steady --link 0.5 --steps 4 --runs 200 -o folder",
+    "stochfuse simulate two-radars --link 0.5 --steps 20 --estimator stand-alone",
 )
 
 
