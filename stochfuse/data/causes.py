@@ -1,0 +1,655 @@
+"""What is wrong with a simulator: known mistakes, each tried for how well it explains the results.
+
+A mistake makes another simulator (`stochfuse.data.mistakes`), and that shows other numbers m (`supposed`).  With the
+results' means x̄ and the covariance C of these, from the runs themselves, over the steps of a link
+
+    T² = (x̄ − m)ᵀ (C + C_m)⁻¹ (x̄ − m)        Hotelling's, with the freedom of its cells, less one for a number estimated
+
+where C_m is how far the sample behind m is known: m = expected + mean of (what the mistaken simulator shows − what the
+right one shows), over the same histories where that is closer than what it shows by itself.  Links are independent; the
+T² of each becomes a χ² of equal probability, and these add up.  Cells that do not vary have to be met to their digits.
+A mistake explains the results if p is above the crosscheck's level.
+
+The likeliest comes first: of those that explain, by T² plus the logarithm of the number of runs for every number that
+was estimated (Schwarz), plus how unlike the runs of each cell are spread (4 λ² of Kolmogorov and Smirnov's λ of two
+samples, with slack for what is estimated); the others by how far the cells are off, Σ log(1 + z²), in which no cell
+decides alone.  A mistake that explains no better than that nothing is wrong is none.  Where no single one explains,
+pairs of the nearest are tried.  An unknown number is found by parabolas through the cells' means.
+
+The first steps and some links are enough to tell mistakes apart, so that long files take no longer than short ones.
+
+Wrong links: µ of each row is estimated, from the polynomials of the general formulation where the prediction has them.
+Dependent runs: the results would be right, with the number of runs that their own correlation leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
+from math import log
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from stochfuse.data.mistakes import DEPENDENT, MISTAKES, WRONG_LINK, Mistake, Variant
+from stochfuse.data.supposed import CLAIMED, ERROR, SQUARED, Block, Cell, Sampler, Simulator
+from stochfuse.engines.distribution import Distribution
+from stochfuse.engines.progress import listener
+from stochfuse.errors import StochfuseError
+from stochfuse.prediction.result import Prediction
+from stochfuse.scenario.network import LinkRows, uniform_rows
+from stochfuse.scenario.registry import BROADCAST_PRIOR, LFG
+from stochfuse.scenario.system import System
+
+ALPHA = 0.001
+ROUGHLY, CLOSELY = 400, 4000
+"""Runs of a sample: of every mistake, and of those that may explain the results."""
+WORTH = 1e-9
+"""p-value from which on a mistake is looked at closely."""
+NEAREST, PAIRED, LISTED = 6, 6, 8
+"""Mistakes that are looked at closely, those tried in pairs, and causes named that do not explain."""
+LINKS, CELLS, STEPS = 4, 60, (8, 8, 4, 3)
+"""Links, cells of a link, and first steps, of 1, 2, 3 and more agents, that are looked at."""
+BETTER, MOST_APART = 6.0, 100.0
+"""Least gain in T² over a right simulator; most that the spread of one cell counts."""
+ROUNDING = 1e-6
+"""Relative difference of cells that do not vary which is rounding."""
+APPROXIMATE = "approximate-prediction"
+
+
+class Cause(NamedTuple):
+    """What may be wrong.
+
+    Parameters
+    ----------
+    cause : name of the mistake; of two at once "a+b".
+    explains : whether the results agree with a simulator that makes it.
+    p : probability that such a simulator differs as much as the results do, or more.
+    text : what it is, and how well it explains, in a line.
+    estimate : the number that was estimated, or None.
+    remaining : largest |z| over the cells that is left.
+    of : the mistakes' names.
+    """
+
+    cause: str
+    explains: bool
+    p: float
+    text: str
+    estimate: float | None
+    remaining: float
+    of: tuple[str, ...]
+
+
+class _Fit(NamedTuple):
+    """How well some numbers explain the results: T², freedom, p, how far cells are off, and the largest |z|."""
+
+    distance: float
+    freedom: int
+    p: float
+    off: float
+    largest: float
+    where: str
+
+
+class _Means(NamedTuple):
+    """What a simulator shows, per block: means, covariance of these, and covariance of a run."""
+
+    mean: list[np.ndarray]
+    noise: list[np.ndarray]
+    spread: list[np.ndarray]
+    shown: list[np.ndarray] | None = None
+
+
+class _Tried(NamedTuple):
+    """A mistake, the way to make it that comes closest, and how close.
+
+    Parameters
+    ----------
+    at : number that was estimated, where one was, in the variant's own terms.
+    numbers : how many were.
+    apart : how unlike the runs are spread, as a χ².
+    shown : the numbers in words; empty: `at`.
+    """
+
+    mistakes: tuple[Mistake, ...]
+    variant: Variant | None
+    fit: _Fit
+    at: float = 0.0
+    numbers: int = 0
+    apart: float = 0.0
+    shown: str = ""
+
+
+def diagnose(
+    prediction: Prediction,
+    rows: LinkRows,
+    blocks: Sequence[Block],
+    *,
+    alpha: float = ALPHA,
+    resolution: float = 0.0,
+) -> tuple[Cause, ...]:
+    """Say what would explain results that disagree with a prediction.
+
+    Parameters
+    ----------
+    prediction : what the results were compared with.
+    rows : links that it was asked for.
+    blocks : the results, one block for each link probability.
+    alpha : probability that the right cause is said not to explain.
+    resolution : half a unit of the last digit of the results' numbers.
+
+    Returns
+    -------
+    tuple of Cause
+        The likeliest first; all that explain, and the nearest of those that do not.
+
+    Raises
+    ------
+    UsageError
+        If blocks name rows or agents that the prediction does not have.
+    """
+    return _Diagnosis(prediction, *_fewer(prediction, rows, blocks), alpha, resolution).causes()
+
+
+def _fewer(
+    prediction: Prediction, rows: LinkRows, blocks: Sequence[Block]
+) -> tuple[LinkRows, System, tuple[Block, ...]]:
+    """As many links, steps and cells as are enough."""
+    if len(blocks) > LINKS:
+        blocks = [blocks[i] for i in np.unique(np.linspace(0, len(blocks) - 1, LINKS).astype(int))]
+    first = min(min(cell.step for cell in block.cells) for block in blocks)
+    last = max(first, STEPS[min(len(prediction.group_of), len(STEPS)) - 1])
+    last = min(last, max(cell.step for block in blocks for cell in block.cells))
+    found = []
+    for number, block in enumerate(blocks):
+        here = [i for i, cell in enumerate(block.cells) if cell.step <= last]
+        here = [here[i] for i in np.unique(np.linspace(0, len(here) - 1, min(CELLS, len(here))).astype(int))]
+        values = None if block.values is None else block.values[:, here]
+        found.append(Block(block.link, number, tuple(block.cells[i] for i in here), values))
+    chosen = rows.take(np.array([block.row for block in blocks]))
+    if chosen.varies:
+        chosen = replace(chosen, link=chosen.link[:, :last])
+    return chosen, prediction.scenario.until(last).system, tuple(block for block in found if block.cells)
+
+
+def summary(causes: Sequence[Cause]) -> str:
+    """Return in one line what was found."""
+    explaining = [c for c in causes if c.explains]
+    if explaining:
+        others = f"; so do {', '.join(c.cause for c in explaining[1:])}" if len(explaining) > 1 else ""
+        two = "two faults: " if len(explaining[0].of) > 1 else ""
+        return f"likely cause: {two}{' and '.join(explaining[0].of)} explains the numbers{others}"
+    known = len(MISTAKES) + 2
+    if not causes:
+        return f"none of the {known} known mistakes can be tried on this scenario"
+    nearest = causes[0]
+    return (
+        f"none of the {known} known mistakes explains the numbers; nearest {' and '.join(nearest.of)}, leaves |z| up "
+        f"to {nearest.remaining:.3g}"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Diagnosis:
+    prediction: Prediction
+    rows: LinkRows
+    system: System
+    blocks: tuple[Block, ...]
+    alpha: float
+    resolution: float
+
+    def causes(self) -> tuple[Cause, ...]:
+        """All of it."""
+        rough = _Trial(self, ROUGHLY)
+        nothing = self.judge(self.expected).distance
+        tried = self._singles(rough)
+        best = [*self._closer(tried), *self._others(rough)]
+        if not any(self._explains(t) for t in best):
+            best += self._closer(self._pairs(rough, tried))
+        best = [t for t in best if not self._explains(t) or t.fit.distance < nothing - BETTER]
+        ranked = sorted(best, key=self._rank)
+        explaining = sum(map(self._explains, ranked))
+        return tuple(map(self._cause, ranked[: max(LISTED, explaining)]))
+
+    def _others(self, trial: _Trial) -> list[_Tried]:
+        found = (self._wrong_link(trial), self._dependent(trial), self._approximate(trial))
+        return [t for t in found if t is not None]
+
+    @property
+    def base(self) -> Simulator:
+        """The right simulator."""
+        p = self.prediction
+        estimator = LFG if p.estimator == BROADCAST_PRIOR else p.estimator
+        return Simulator(self.system, self.rows, estimator, followed=self.errors)
+
+    @property
+    def errors(self) -> bool:
+        """Whether some cell is of the true error."""
+        return any(cell.quantity != CLAIMED for block in self.blocks for cell in block.cells)
+
+    @property
+    def runs(self) -> int:
+        """Runs of the largest cell."""
+        return max(cell.runs for block in self.blocks for cell in block.cells)
+
+    @property
+    def expected(self) -> _Means:
+        """What the prediction expects."""
+        mean = [np.array([cell.expected for cell in block.cells]) for block in self.blocks]
+        nothing = [np.zeros((len(m), len(m))) for m in mean]
+        return _Means(mean, nothing, nothing)
+
+    def _singles(self, trial: _Trial) -> list[_Tried]:
+        found = []
+        for number, mistake in enumerate(MISTAKES):
+            listener().advance(f"trying {mistake.name}", number, len(MISTAKES))
+            best = trial.best((mistake,), mistake.variants(self.base))
+            found += [] if best is None else [best]
+        return sorted(found, key=self._rank)
+
+    def _pairs(self, trial: _Trial, singles: Sequence[_Tried]) -> list[_Tried]:
+        chosen = sorted(singles, key=lambda t: t.fit.off)[:PAIRED]
+        pairs, found = list(combinations(chosen, 2)), []
+        for number, (one, other) in enumerate(pairs):
+            names = (*one.mistakes, *other.mistakes)
+            listener().advance(f"trying {names[0].name} and {names[1].name}", number, len(pairs))
+            best = trial.best(names, _together(one, other))
+            found += [] if best is None else [best]
+        return sorted(found, key=self._rank)
+
+    def _closer(self, tried: Sequence[_Tried]) -> list[_Tried]:
+        """The same, of larger samples where that may decide."""
+        near = [t for t in tried if t.fit.p > WORTH][:NEAREST]
+        trial, out = _Trial(self, min(CLOSELY, 2 * max(self.runs, ROUGHLY))), []
+        for t in tried:
+            variants = [t.variant] if t in near and t.variant is not None else []
+            # a search that has found something begins anew around it
+            variants = [v._replace(grid=(t.at - 0.05, t.at, t.at + 0.05)) if v.grid else v for v in variants]
+            again = trial.best(t.mistakes, variants) if variants else None
+            out.append(again or t)
+        return out
+
+    def _explains(self, t: _Tried) -> bool:
+        return t.fit.p > self.alpha
+
+    def _rank(self, t: _Tried) -> tuple[float, ...]:
+        price = log(max(2, self.runs)) * (t.numbers + len(t.mistakes) - 1)
+        if self._explains(t):
+            return (0.0, round(t.fit.distance + t.apart + price, 6))
+        return (1.0, t.fit.off + price / max(1, t.fit.freedom))
+
+    def _cause(self, t: _Tried) -> Cause:
+        names = tuple(m.name for m in t.mistakes)
+        seen = t.at if t.variant is None else t.variant.shown(t.at)
+        what = " and ".join(m.text.format(t.shown or seen) for m in t.mistakes)
+        two = "two faults: " if len(names) > 1 else ""
+        left = f"largest |z| {t.fit.largest:.3g} at {t.fit.where}"
+        how = f"explains all but p = {t.fit.p:.2g}" if self._explains(t) else f"does not explain (p = {t.fit.p:.2g})"
+        text = f"{' and '.join(names)}: {two}{what}; {how}, {left}"
+        return Cause(
+            cause="+".join(names),
+            explains=self._explains(t),
+            p=t.fit.p,
+            text=text,
+            estimate=float(seen) if t.numbers else None,
+            remaining=t.fit.largest,
+            of=names,
+        )
+
+    def judge(self, means: _Means, estimated: int = 0, runs: Sequence[float] | None = None) -> _Fit:
+        """How well some means explain the results.
+
+        Parameters
+        ----------
+        runs : per block, number of runs that are as good as independent; default: all.
+        """
+        distance, freedom, exact, off, largest, where = 0.0, 0, 0, 0.0, -1.0, ""
+        for b, block in enumerate(self.blocks):
+            r, C = np.array([cell.mean for cell in block.cells]) - means.mean[b], means.noise[b]
+            known, floor = np.flatnonzero(~np.isnan(r)), self._floor(b)
+            if not len(known):
+                continue
+            C = (self._covariance(b, means.spread[b], runs) + C)[np.ix_(known, known)]
+            r, floor = r[known], floor[known]
+            deviation = np.sqrt(np.maximum(np.diagonal(C), 0.0))
+            fixed = deviation <= floor
+            beyond = np.maximum(0.0, np.abs(r) - floor)
+            z = beyond / np.where(fixed, floor, np.where(deviation > 0, deviation, 1.0))
+            off += float(np.log1p(z**2).sum())
+            if z.max() > largest:
+                largest, cell = float(z.max()), block.cells[int(known[z.argmax()])]
+                where = f"k = {cell.step}" if not block.link else f"µ = {block.link}, k = {cell.step}"
+            loose = np.flatnonzero(~fixed)
+            exact += int(fixed.sum())
+            T, d = _hotelling(np.copysign(beyond, r)[loose], C[np.ix_(loose, loose)], self._sample(b, runs))
+            distance, freedom = distance + T + float((z[fixed] ** 2).sum()), freedom + d
+        from scipy.special import chdtrc
+
+        left = max(freedom - (0 if exact else estimated), 1)
+        return _Fit(distance, left, float(chdtrc(left, distance)), off, largest, where)
+
+    def _sample(self, b: int, runs: Sequence[float] | None) -> float:
+        return float(runs[b]) if runs is not None else float(min(cell.runs for cell in self.blocks[b].cells))
+
+    def _floor(self, b: int) -> np.ndarray:
+        means = np.array([cell.mean for cell in self.blocks[b].cells])
+        return self.resolution + ROUNDING * np.maximum(np.abs(means), 1e-300)
+
+    def _covariance(self, b: int, spread: np.ndarray, runs: Sequence[float] | None) -> np.ndarray:
+        """Covariance of a block's means: the runs' own, where they vary; else that of the simulator supposed."""
+        block = self.blocks[b]
+        count = np.array([float(cell.runs) for cell in block.cells])
+        each = count if runs is None else np.full(len(count), float(runs[b]))
+        supposed = spread / np.sqrt(np.outer(each, each))
+        if block.values is None:
+            errors = np.array(
+                [cell.error if cell.quantity != CLAIMED or not spread.any() else 0.0 for cell in block.cells]
+            )
+            return supposed + np.diag(np.maximum(0.0, errors**2 - np.diagonal(supposed) * (errors > 0)))
+        C = self._of_runs[b] / np.sqrt(np.outer(each, each))
+        still = np.diagonal(C) <= self._floor(b) ** 2
+        C[still] = C[:, still] = 0.0
+        C[np.ix_(still, still)] = np.where(
+            np.outer(still, still)[np.ix_(still, still)], supposed[np.ix_(still, still)], 0
+        )
+        return C
+
+    def apart(self, means: _Means) -> float:
+        """How unlike the runs are spread over the cells of claimed numbers, as a χ²; 0 where only means are given."""
+        total = 0.0
+        for b, block in enumerate(self.blocks):
+            for i, cell in enumerate(block.cells):
+                if block.values is not None and means.shown is not None and cell.quantity == CLAIMED:
+                    X = means.shown[b][:, i] + (means.mean[b][i] - means.shown[b][:, i].mean())
+                    slack = 4.0 * cell.error + self._floor(b)[i]
+                    total += min(MOST_APART, _unlike(block.values[:, i], X, slack))
+        return total
+
+    @cached_property
+    def _of_runs(self) -> list[np.ndarray]:
+        """Covariance of a run's values, per block."""
+        return [np.zeros(0) if x.values is None else np.atleast_2d(np.cov(x.values, rowvar=False)) for x in self.blocks]
+
+    def _wrong_link(self, trial: _Trial) -> _Tried | None:
+        """µ of every row as it would fit best."""
+        curve = _curve(self.prediction, self.rows, self.blocks)
+        if curve is None:
+            return None
+        listener().advance(f"trying {WRONG_LINK}", len(MISTAKES), len(MISTAKES))
+        grid = np.linspace(0.0, 1.0, 33)
+        at = curve(grid)
+        nothing = [np.zeros((m.shape[1], m.shape[1])) for m in at]
+        found = []
+        for b in range(len(self.blocks)):
+            µ = grid
+            mean = at[b]
+            for _ in range(4):
+                scores = [self._alone(b, row, nothing[b]) for row in mean]
+                best = int(np.argmin(scores))
+                low, high = µ[max(0, best - 1)], µ[min(len(µ) - 1, best + 1)]
+                µ = np.linspace(low, high, 9)
+                mean = curve(µ)[b]
+            scores = [self._alone(b, row, nothing[b]) for row in mean]
+            found.append((float(µ[int(np.argmin(scores))]), mean[int(np.argmin(scores))]))
+        fit = self.judge(_Means([m for _, m in found], nothing, nothing), len(self.blocks))
+        shown = ", ".join(f"{µ:.4g}" for µ, _ in found)
+        whose = ", ".join(block.link or "given" for block in self.blocks)
+        mistake = Mistake(
+            WRONG_LINK, f"the links' probabilities are {{0}} where they should be {whose}", lambda _: iter(())
+        )
+        rows = uniform_rows([µ for µ, _ in found])
+        means = trial.means(replace(self.base, rows=rows))
+        apart = 0.0 if means is None else self.apart(means)
+        return _Tried((mistake,), None, fit, found[0][0], len(found), apart, shown)
+
+    def _alone(self, b: int, mean: np.ndarray, nothing: np.ndarray) -> float:
+        alone = replace(self, blocks=self.blocks[b : b + 1])
+        return alone.judge(_Means([mean], [nothing], [nothing])).distance
+
+    def _dependent(self, trial: _Trial) -> _Tried | None:
+        """The right results, of fewer runs than there seem to be."""
+        means = trial.means(self.base)
+        if means is None:
+            return None
+        effective, dependent = [], False
+        for block, spread in zip(self.blocks, means.spread, strict=True):
+            n = float(min(cell.runs for cell in block.cells))
+            found = None if block.values is None else independent_runs(block.values, vary=bool(spread.any()))
+            dependent |= found is not None
+            effective.append(n if found is None else found)
+        if not dependent:
+            return None
+        fit = self.judge(means._replace(mean=self.expected.mean, noise=self.expected.noise), runs=effective)
+        text = "the runs are not independent of each other, and tell no more than about {0} that are"
+        shown = f"{min(effective):.3g}"
+        return _Tried((Mistake(DEPENDENT, text, lambda _: iter(())),), None, fit, min(effective), 1, 0.0, shown)
+
+    def _approximate(self, trial: _Trial) -> _Tried | None:
+        if self.prediction.nature not in ("approximate", "bound"):
+            return None
+        text = "nothing is wrong with the simulator: the prediction is approximate, and exact numbers are as the file's"
+        return trial.best((Mistake(APPROXIMATE, text, lambda _: iter(())),), [Variant(lambda _: self.base)])
+
+
+class _Trial:
+    """Tries simulators with samples of one size."""
+
+    def __init__(self, diagnosis: _Diagnosis, runs: int) -> None:
+        self.diagnosis = diagnosis
+        self.sampler = Sampler(runs, errors=diagnosis.errors)
+        self._right: list[np.ndarray] | None = None
+
+    def means(self, simulator: Simulator) -> _Means | None:
+        """What a simulator shows; None if there is no such simulator."""
+        d = self.diagnosis
+        try:
+            with np.errstate(all="ignore"):
+                if self._right is None:
+                    self._right = self.sampler.shown(d.base, d.blocks)
+                shown = self.sampler.shown(simulator, d.blocks)
+        except (StochfuseError, np.linalg.LinAlgError):
+            return None
+        mean, noise, spread = [], [], []
+        exact = d.prediction.nature in ("exact", "sampled")
+        for X, Z, expected in zip(shown, self._right, d.expected.mean, strict=True):
+            unknown = np.isnan(X).all(axis=0)
+            if not np.isfinite(X[:, ~unknown]).all():
+                return None
+            X = np.where(unknown, Z, X)
+            D, own = X - Z, _covariance_of(X)
+            apart = _covariance_of(D)
+            # cells of unlike sizes count alike
+            scale = np.where(np.diagonal(own) > 0, np.diagonal(own), 1.0)
+            closer = exact and (np.diagonal(apart) / scale).sum() < (np.diagonal(own) / scale).sum() + 1e-300
+            closer = closer or (exact and not apart.any())
+            mean.append(np.where(unknown, np.nan, expected + D.mean(axis=0) if closer else X.mean(axis=0)))
+            noise.append((apart if closer else own) / len(X))
+            spread.append(own)
+        return _Means(mean, noise, spread, shown)
+
+    def best(self, mistakes: tuple[Mistake, ...], variants: Iterator[Variant] | Sequence[Variant]) -> _Tried | None:
+        """The variant that comes closest to the results."""
+        found = [t for v in variants if (t := self._fitted(mistakes, v)) is not None]
+        return min(found, key=self.diagnosis._rank) if found else None
+
+    def _fitted(self, mistakes: tuple[Mistake, ...], variant: Variant) -> _Tried | None:
+        if not variant.grid:
+            means = self.means(variant.of(0.0))
+            return None if means is None else self._tried(mistakes, variant, means)
+        points: dict[float, _Means] = {}
+        for at in variant.grid:
+            means = self.means(variant.of(at))
+            if means is not None:
+                points[at] = means
+        if len(points) < 3:
+            return None
+        judge = self.diagnosis.judge
+        for _ in range(8):
+            best = min(points, key=lambda at: judge(points[at], 1).distance)
+            new = _lowest(points, best, judge)
+            if new is None or min(abs(new - at) for at in points) < 1e-9:
+                break
+            means = self.means(variant.of(new))
+            if means is None:
+                break
+            points[new] = means
+        best = min(points, key=lambda at: judge(points[at], 1).distance)
+        return self._tried(mistakes, variant, points[best], best)
+
+    def _tried(self, mistakes: tuple[Mistake, ...], variant: Variant, means: _Means, at: float = 0.0) -> _Tried:
+        d, numbers = self.diagnosis, int(bool(variant.grid))
+        fit = d.judge(means, numbers)
+        apart = d.apart(means) if fit.p > WORTH else 0.0
+        return _Tried(mistakes, variant, fit, at, numbers, apart)
+
+
+def _lowest(points: dict[float, _Means], best: float, judge: Callable[..., _Fit]) -> float | None:
+    """Where the cells' parabolas through three points come closest to the results, near the best of these."""
+    three = sorted(sorted(points, key=lambda at: abs(at - best))[:3])
+    a, b, c = three
+    low, high = a - (b - a) / 2, c + (c - b) / 2
+    means = [points[at] for at in three]
+
+    def distance(at: float) -> float:
+        w = (
+            (at - b) * (at - c) / ((a - b) * (a - c)),
+            (at - a) * (at - c) / ((b - a) * (b - c)),
+            (at - a) * (at - b) / ((c - a) * (c - b)),
+        )
+        mean = [sum(x * m.mean[i] for x, m in zip(w, means, strict=True)) for i in range(len(means[0].mean))]
+        return judge(points[best]._replace(mean=mean), 1).distance
+
+    from scipy.optimize import minimize_scalar
+
+    grid = np.linspace(low, high, 9)
+    near = int(np.argmin([distance(at) for at in grid]))
+    bounds = (grid[max(0, near - 1)], grid[min(8, near + 1)])
+    found: Any = minimize_scalar(distance, bounds=bounds, method="bounded", options={"xatol": 1e-10 * (high - low)})
+    return float(found.x)
+
+
+def _unlike(one: np.ndarray, other: np.ndarray, slack: float) -> float:
+    """4 λ² of Kolmogorov and Smirnov's test of two samples, whose values may be off by some slack."""
+    one, other = np.sort(one), np.sort(other)
+
+    def below(sample: np.ndarray, x: np.ndarray) -> np.ndarray:
+        return np.searchsorted(sample, x, side="right") / len(sample)
+
+    far = max(
+        float((below(one, one) - below(other, one + slack)).max(initial=0.0)),
+        float((below(other, other) - below(one, other + slack)).max(initial=0.0)),
+    )
+    return 4.0 * far**2 * len(one) * len(other) / (len(one) + len(other))
+
+
+def _together(one: _Tried, other: _Tried) -> Iterator[Variant]:
+    """Ways to make two mistakes at once; of two unknown numbers none."""
+    first, (mistake,) = one.variant, other.mistakes
+    if first is None or other.variant is None or (first.grid and other.variant.grid):
+        return
+    start = first.grid[0] if first.grid else 0.0
+    for number, second in enumerate(mistake.variants(first.of(start))):
+        if first.grid:
+
+            def of(at: float, number: int = number) -> Simulator:
+                return list(mistake.variants(first.of(at)))[number].of(0.0)
+
+            if not second.grid:
+                yield Variant(of, first.grid, first.shown)
+        else:
+            yield second
+
+
+def _hotelling(r: np.ndarray, C: np.ndarray, runs: float) -> tuple[float, int]:
+    """T² as a χ² of equal probability, and its freedom; directions that hardly vary are rounding."""
+    from scipy.special import chdtri, fdtrc
+
+    if not len(r):
+        return 0.0, 0
+    deviation = np.sqrt(np.diagonal(C))
+    correlation = C / np.outer(deviation, deviation)
+    # few runs know less of a correlation than of a deviation
+    shrink = min(1.0, len(r) / max(runs, 1.0))
+    values, vectors = np.linalg.eigh((1.0 - shrink) * correlation + shrink * np.eye(len(r)))
+    firm = values > 1e-6
+    T = float((((vectors.T @ (r / deviation))[firm]) ** 2 / values[firm]).sum())
+    d = int(firm.sum())
+    if runs <= d + 2:
+        return T, d
+    p = float(fdtrc(d, runs - d, T * (runs - d) / (d * (runs - 1.0))))
+    return (float(chdtri(d, p)) if p > 1e-280 else T), d
+
+
+def _covariance_of(X: np.ndarray) -> np.ndarray:
+    C = np.atleast_2d(np.cov(X, rowvar=False))
+    tiny = 1e-24 * np.maximum(np.abs(X).max(axis=0) ** 2, 1e-300)
+    still = np.diagonal(C) <= tiny
+    C[still] = C[:, still] = 0.0
+    return C
+
+
+def _curve(
+    prediction: Prediction, rows: LinkRows, blocks: Sequence[Block]
+) -> Callable[[np.ndarray], list[np.ndarray]] | None:
+    """What is expected of link probabilities (points,), per block (points, cells); None where it is no polynomial."""
+    outcomes = prediction.outcomes
+    if outcomes is None or not outcomes.polynomial or rows.common(prediction.scenario.network) is None:
+        return None
+    if prediction.scenario.network.agents < 2:
+        return None
+
+    def one(cell: Cell, µ: np.ndarray) -> np.ndarray:
+        groups = sorted({int(prediction.group_of[a - 1]) for a in cell.agents})
+        share = [sum(int(prediction.group_of[a - 1]) == g for a in cell.agents) for g in groups]
+        states = list(cell.metric.states)
+        if cell.quantity == SQUARED:
+            M = outcomes.covariance(µ, "rms")[:, cell.step - 1, groups]
+            return np.average(np.trace(M[..., states, :][..., states], axis1=-2, axis2=-1), axis=1, weights=share)
+        if cell.quantity == ERROR:
+            b = outcomes.covariance(µ, "bias")[:, cell.step - 1, groups, states[0], 0]
+            return np.average(b, axis=1, weights=share)
+        if cell.quantity != CLAIMED:
+            return np.full(len(µ), cell.expected)
+        if cell.metric.linear:
+            M = outcomes.covariance(µ)[:, cell.step - 1]
+            return np.average(np.stack([cell.metric.of(M[:, g]) for g in groups]), axis=0, weights=share)
+        moved = replace(outcomes, links=uniform_rows(µ))
+        spread = [moved.distribution(cell.metric, cell.step, [g]) for g in groups]
+        return np.average([Distribution.mean(s) for s in spread], axis=0, weights=share)
+
+    return lambda µ: [np.stack([one(cell, µ) for cell in block.cells], axis=1) for block in blocks]
+
+
+def independent_runs(values: np.ndarray, *, vary: bool = True) -> float | None:
+    """Return how many independent runs tell as much as dependent ones; None where no dependence shows.
+
+    Parameters
+    ----------
+    values : (runs, cells) in the order of the runs.
+    vary : whether runs should differ.
+
+    Notes
+    -----
+    n / (1 + 2 Σ (1 − h/n) ρ(h)) over the lags h at which the correlation ρ(h), averaged over the cells, stands out;
+    runs that are all alike are one.
+    """
+    n = len(values)
+    X = values - values.mean(axis=0)
+    scale = X.std(axis=0)
+    moving = scale > ROUNDING * np.maximum(np.abs(values).max(axis=0), 1e-300)
+    if n < 20:
+        return None
+    if not moving.any():
+        return 1.0 if vary else None
+    X = X[:, moving] / scale[moving]
+    size = 1 << (2 * n - 1).bit_length()
+    power = np.abs(np.fft.rfft(X, size, axis=0)) ** 2
+    ρ = np.fft.irfft(power.mean(axis=1), size)[: n // 2] / n
+    # cells hang together, so that their average is taken to be as uncertain as one of them
+    lags = np.flatnonzero(np.abs(ρ[1:]) > 6.0 / np.sqrt(n - np.arange(1, len(ρ)))) + 1
+    if not len(lags):
+        return None
+    inflation = 1.0 + 2.0 * float(((1.0 - lags / n) * ρ[lags]).sum())
+    return n / max(inflation, 1.0) if inflation > 1.0 else None
