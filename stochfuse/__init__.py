@@ -19,6 +19,10 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from stochfuse.data.crosscheck import Verdict as Verdict
+    from stochfuse.data.crosscheck import check_results as check_results
+    from stochfuse.data.crosscheck import crosscheck as crosscheck
+    from stochfuse.data.results import read_results as read_results
     from stochfuse.errors import NoAnswerError as NoAnswerError
     from stochfuse.errors import ScenarioError as ScenarioError
     from stochfuse.errors import StochfuseError as StochfuseError
@@ -38,14 +42,12 @@ if TYPE_CHECKING:
     from stochfuse.questions.agents_needed import agents_needed as agents_needed
     from stochfuse.questions.critical import Critical as Critical
     from stochfuse.questions.critical import critical as critical
-    from stochfuse.questions.crosscheck import check_results as check_results
     from stochfuse.questions.least_link import LeastLink as LeastLink
     from stochfuse.questions.least_link import least_link as least_link
     from stochfuse.questions.least_value import LeastValue as LeastValue
     from stochfuse.questions.least_value import least_value as least_value
     from stochfuse.questions.messages import MessageLoad as MessageLoad
     from stochfuse.questions.messages import message_load as message_load
-    from stochfuse.questions.results import read_results as read_results
     from stochfuse.questions.sensitivity import Sensitivity as Sensitivity
     from stochfuse.questions.sensitivity import sensitivity as sensitivity
     from stochfuse.questions.sensitivity import share_of_gain as share_of_gain
@@ -78,8 +80,10 @@ _HOME = {
     "StochfuseError": "errors",
     "Swept": "prediction.swept",
     "UsageError": "errors",
+    "Verdict": "data.crosscheck",
     "agents_needed": "questions.agents_needed",
-    "check_results": "questions.crosscheck",
+    "check_results": "data.crosscheck",
+    "crosscheck": "data.crosscheck",
     "compare": "prediction.compare",
     "compare_estimators": "prediction.compare",
     "critical": "questions.critical",
@@ -97,7 +101,7 @@ _HOME = {
     "predict": "prediction.predict",
     "predict_many": "prediction.predict",
     "predict_states": "prediction.states",
-    "read_results": "questions.results",
+    "read_results": "data.results",
     "sensitivity": "questions.sensitivity",
     "share_of_gain": "questions.sensitivity",
     "steady_state": "prediction.steady_state",
@@ -120,12 +124,14 @@ __all__ = [
     "StochfuseError",
     "Swept",
     "UsageError",
+    "Verdict",
     "__version__",
     "agents_needed",
     "check_results",
     "compare",
     "compare_estimators",
     "critical",
+    "crosscheck",
     "derive_general",
     "derive_optimal",
     "derive_simplified",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -10,24 +10,26 @@ from stochfuse.cli.options import (
     SHOWN,
     WORK,
     Changes,
+    EstimatorOption,
     Graphs,
     MetricOption,
+    Sampling,
     ScenarioArgument,
-    Unplotted,
+    Weighing,
+    Written,
     choice,
     option,
     settings_for,
 )
 from stochfuse.errors import UsageError
-from stochfuse.scenario.registry import GENERAL, NAIVE, SIMPLIFIED
+from stochfuse.scenario.registry import GENERAL, METHODS, MONTE_CARLO, SIMPLIFIED
 
-if TYPE_CHECKING:
-    from stochfuse.questions.results import SimulatorResults
-    from stochfuse.scenario.network import LinkRows
-    from stochfuse.scenario.scenario import Scenario
-
-AGAINST = (GENERAL, SIMPLIFIED, NAIVE)
-EXAMPLES = ("stochfuse crosscheck results.csv", "stochfuse crosscheck means.json my.toml --method naive --alpha 0.01")
+EXAMPLES = (
+    "stochfuse crosscheck results.csv",
+    "stochfuse crosscheck means.json my.toml --method naive --alpha 0.01",
+    "stochfuse crosscheck runs.parquet my.toml --estimator split-ci --plot check.png",
+    "stochfuse crosscheck runs.csv --columns covariance=P_trace,link=mu",
+)
 
 
 def crosscheck(
@@ -35,16 +37,26 @@ def crosscheck(
         str,
         typer.Argument(
             metavar="FILE",
-            help="CSV or JSON, - for standard input: columns run, agent, step, link, covariance and optionally "
-            "error; or means: agent, step, link, covariance, count, std.",
+            help="CSV, JSON or Parquet, - for standard input: columns run, agent, step, link, and of covariance, "
+            "squared_error, error, nees what there is; or means: agent, step, link, covariance, count, std.",
         ),
     ],
     scenario: ScenarioArgument = "thesis-transient",
     changes: Changes = Changes(),
+    columns: Annotated[
+        str | None,
+        option("Names that FILE has for columns: covariance=P_trace,link=mu.", SHOWN, metavar="OURS=THEIRS"),
+    ] = None,
     method: Annotated[
-        str,
-        choice(AGAINST, f"Prediction to check against: {', '.join(AGAINST)} (approximate); default: general.", WORK),
-    ] = GENERAL,
+        str | None,
+        choice(
+            METHODS,
+            f"Prediction to check against: {', '.join(METHODS)} (simplified is approximate); default: general, or what "
+            "takes the estimator and the scenario.",
+            WORK,
+        ),
+    ] = None,
+    estimator: EstimatorOption = None,
     metric: MetricOption = None,
     alpha: Annotated[
         float,
@@ -52,88 +64,72 @@ def crosscheck(
             "Probability that a right simulator is called wrong, over all cells; default: 0.001.", SHOWN, metavar="P"
         ),
     ] = 0.001,
+    sampling: Sampling = Sampling(),
     graphs: Graphs = Graphs(),
-    to: Unplotted = Unplotted(),
+    weighing: Weighing = Weighing(),
+    to: Written = Written(),
 ) -> None:
     """Compare a simulator's results with the prediction; exit 0 if they agree, 1 if they do not.
 
-    The column covariance holds the claimed covariance after fusion, as the metric says (default: trace). Per cell a
-    z-score; the verdict corrects for the number of cells.
+    Columns: covariance (claimed after fusion, as the metric says; default: trace) or covariance:METRIC, squared_error,
+    error:STATE (signed), nees. Per cell a z-score; the verdict corrects for the number of cells.
     """
-    from stochfuse.kalman.metrics import metric as metric_of
-    from stochfuse.prediction.predict import predict
-    from stochfuse.questions.crosscheck import check_results
-    from stochfuse.questions.results import read_results
+    from stochfuse.data.crosscheck import crosscheck as check
+    from stochfuse.data.results import read_results
     from stochfuse.report import crosschecks
-    from stochfuse.report.predictions import PredictionView
 
     to.check(file, scenario)
-    settings = settings_for([method], **graphs._asdict())
+    given = {"estimator": estimator, **sampling._asdict(), **graphs._asdict(), **weighing._asdict()}
+    settings = settings_for([GENERAL, MONTE_CARLO] if method is None else [method], **given)
     if not 0 < alpha < 1:
         raise UsageError(f"--alpha: expected a probability between 0 and 1, got {alpha:g}")
     if file == scenario == "-":
         raise UsageError("FILE and SCENARIO: expected at most one of them on standard input, got - for both")
-    results = read_results(file)
-    last = int(results.step.max())
-    given, links = changes.of(scenario)
-    if last > given.network.steps:
-        raise UsageError(
-            f"{results.at(int(results.step.argmax()))}, column 'step': expected at most the scenario's "
-            f"{given.network.steps} steps, got {last}; see --steps"
-        )
-    given = given.until(last)
-    chosen = metric_of(metric or given.metric or "trace", given.model)
-    prediction = predict(given, _rows(results, given, links), method, **settings)
-    verdict = check_results(results, prediction, chosen, alpha)
-    shown = crosschecks.CrosscheckView(results, PredictionView(prediction, chosen, digits=to.digits), verdict)
-    for note in prediction.notes:
+    results = read_results(file, renamed(columns))
+    chosen, link = changes.of(scenario)
+    verdict = check(results, chosen, method=method, metric=metric, alpha=alpha, link=link, **settings)
+    # what would explain a disagreement belongs here: verdict = replace(verdict, causes=…)
+    shown = crosschecks.CrosscheckView(verdict, to.digits)
+    for note in dict.fromkeys((*verdict.prediction.notes, *verdict.notes)):
         typer.echo(f"note: {note}", err=True)
     if method == SIMPLIFIED:
         typer.echo("note: the simplified formulation is approximate: a right simulator differs from it", err=True)
-    for link, ratio in verdict.consistency.items():
-        where = f" at µ = {link}" if link else ""
-        typer.echo(
-            f"note: column error{where}: mean squared error is {ratio:.3g} times the mean claimed covariance (not "
-            "part of the verdict)",
-            err=True,
-        )
+    for code, ratio in verdict.consistency.items():
+        where = f" at µ = {code}" if code else ""
+        typer.echo(f"note: mean squared error{where} is {ratio:.3g} times the mean claimed covariance", err=True)
     to.write(crosschecks.crosscheck_report(shown))
+    for text in verdict.evidence:
+        typer.echo(f"evidence: {text}", err=True)
     if not verdict.agrees:
         typer.echo("the results disagree with the prediction", err=True)
         raise typer.Exit(1)
 
 
-def _rows(results: SimulatorResults, scenario: Scenario, asked: list[float] | None) -> LinkRows:
-    """Rows of the prediction for the file's link probabilities or names of cases."""
-    from stochfuse.questions.results import ResultsError
-    from stochfuse.scenario.network import stacked_rows
-    from stochfuse.scenario.scenario import link_rows
+def renamed(text: str | None) -> dict[str, str] | None:
+    """Return the columns of `covariance=P_trace,link=mu`; what follows a comma without = belongs to the name before.
 
-    links, cases = results.links, dict(scenario.network.cases)
-    if asked is not None and (links != [""] or len(asked) > 1):
-        raise UsageError("--link: expected one link probability, for a file without a column 'link'")
-    if links == [""]:
-        rows = link_rows(scenario, asked)
-        if len(rows.link) > 1:
-            raise ResultsError(
-                f"{results.source}: expected a column 'link', since the scenario has no link of its own; or --link"
+    Raises
+    ------
+    UsageError
+        If a pair is malformed or a column is named twice.
+    """
+    if text is None:
+        return None
+    pairs: list[str] = []
+    for part in text.split(","):
+        # covariance:rms:x,y=P_rms has a comma of its own
+        if pairs and "=" not in pairs[-1]:
+            pairs[-1] += f",{part}"
+        else:
+            pairs.append(part)
+    found: dict[str, str] = {}
+    for pair in pairs:
+        ours, _, theirs = (word.strip() for word in pair.partition("="))
+        if not ours or not theirs:
+            raise UsageError(
+                f"--columns: expected OURS=THEIRS such as covariance=P_trace,link=mu, got '{pair.strip()}'"
             )
-        return rows
-    if all(link in cases for link in links):
-        return stacked_rows(tuple(links), [cases[link] for link in links], scenario.network)
-    values = []
-    for link in links:
-        try:
-            value = float(link)
-        except ValueError:
-            value = -1.0
-        if not 0 <= value <= 1:
-            where = results.at(int((results.link == link).argmax()))
-            known = f", or a case ({', '.join(cases)})" if cases else ""
-            raise ResultsError(f"{where}, column 'link': expected a probability between 0 and 1{known}, got '{link}'")
-        values.append(value)
-    if scenario.network.link is not None or cases:
-        typer.echo(
-            "note: the file's link probabilities are taken for all links; the scenario's own are not used", err=True
-        )
-    return link_rows(scenario, values)
+        if ours in found:
+            raise UsageError(f"--columns: expected different columns, got {ours} twice")
+        found[ours] = theirs
+    return found

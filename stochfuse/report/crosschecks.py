@@ -1,28 +1,38 @@
-"""A crosscheck as table, CSV and JSON."""
+"""A crosscheck as table, CSV, JSON and figure.
+
+The figure: z-scores over the steps, a mark per link probability, and below them what the simulator found (points with
+two standard errors either way) on what is expected (lines), a panel per quantity and group of agents.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from stochfuse import __version__
-from stochfuse.questions.crosscheck import Cell, Verdict
-from stochfuse.questions.results import SimulatorResults
+from stochfuse.data.crosscheck import Cell, Verdict
+from stochfuse.kalman.metrics import metric
+from stochfuse.report.plot import DASHES, MARKERS, below, figure_class, shades, spread, titled
 from stochfuse.report.predictions import PredictionView, counted
 from stochfuse.report.table import Report, Table, number, to_csv
+from stochfuse.scenario.registry import OPTIMAL
 
 SCHEMA = "stochfuse.crosscheck/1"
+NEES = "Expected NEES: squared error in units of the claimed covariance"
+MOST_PANELS, ACROSS = 6, 3
+LEAST_REACH = 4.0
+"""z-scores up to which an axis of them reaches at least."""
 
 
 @dataclass(frozen=True)
 class CrosscheckView:
-    """What is shown: the results, what was expected of them, and the verdict."""
+    """What is shown: a verdict, and with how many digits."""
 
-    results: SimulatorResults
-    view: PredictionView
     verdict: Verdict
+    digits: int = 5
 
     @property
     def says(self) -> str:
@@ -35,16 +45,44 @@ class CrosscheckView:
         if v.agrees:
             return f"AGREE ({text})"
         where = f"{len(off)} of {cells} differ" if off else "no single cell, but all of them together"
+        if v.evidence:
+            where = v.evidence[0] + (f", and {len(v.evidence) - 1} more" if len(v.evidence) > 1 else "")
+            where += f"; {len(off)} of {cells} differ" if off else ""
         return f"DISAGREE: {where} ({text})"
+
+    @property
+    def senses(self) -> list[tuple[str, str]]:
+        """Quantities and metrics that are compared, in order."""
+        return list(dict.fromkeys((cell.quantity, cell.metric) for cell in self.verdict.cells))
+
+    @property
+    def quantity(self) -> str:
+        """The first quantity."""
+        first = self.senses[0][0] if self.senses else "claimed"
+        return OPTIMAL if first == "claimed" and self.verdict.prediction.method == OPTIMAL else first
+
+    def view(self, quantity: str, name: str) -> PredictionView:
+        """Return the prediction as it is shown of a quantity."""
+        p = self.verdict.prediction
+        named = OPTIMAL if quantity == "claimed" and p.method == OPTIMAL else quantity
+        return PredictionView(p.shown_as(named), metric(name, p.scenario.model), digits=self.digits)
+
+    def what(self, quantity: str, name: str) -> str:
+        """Return in words what is expected."""
+        return NEES if quantity == "nees" else self.view(quantity, name).what
 
     @property
     def titles(self) -> tuple[str, ...]:
         """Lines that say what is compared with what."""
+        v = self.verdict
+        view = self.view("claimed", v.metric.name)
+        notes = [f"evidence: {text}" for text in v.evidence]
         return (
-            f"Crosscheck of {self.results.source}: {self.says}",
-            f"against: {self.view.what}",
-            self.view.whom.partition(";")[0],
-            self.view.how,
+            f"Crosscheck of {v.results.source}: {self.says}",
+            *notes,
+            *(f"against: {self.what(*sense)}" for sense in self.senses),
+            view.whom.partition(";")[0],
+            view.how,
             "±: standard error of the mean; p corr.: p-value times the number of cells",
         )
 
@@ -62,48 +100,60 @@ def _agents(cell: Cell) -> str:
 
 def crosscheck_report(shown: CrosscheckView) -> Report:
     """Return a verdict in every form."""
-    return Report.of(shown, crosscheck_table, crosscheck_csv, crosscheck_json)
+    return Report.of(shown, crosscheck_table, crosscheck_csv, crosscheck_json, draw)
 
 
 def crosscheck_table(shown: CrosscheckView) -> Table:
-    """Return one row per cell."""
-    digits = shown.view.digits
+    """Return one row per cell, with quantity and metric where there are several."""
+    digits, several = shown.digits, len(shown.senses) > 1
     rows = []
     for cell in shown.verdict.cells:
         rows.append(
             (
+                *((_sense(cell),) if several else ()),
                 cell.link,
                 str(cell.step),
                 _agents(cell),
                 str(cell.runs),
                 number(cell.mean, digits),
                 f"{cell.error:.2g}",
-                number(cell.expected, digits),
+                number(cell.expected, digits) + (f" ±{cell.expected_error:.2g}" if cell.expected_error else ""),
                 f"{cell.z:+.2f}" if np.isfinite(cell.z) else "+∞" if cell.z > 0 else "−∞",
                 _p(cell.p) + ("" if cell.agrees else " differs"),
             )
         )
     return Table(
         shown.titles,
-        ("µ", "k", "agents"),
+        (*(("of",) if several else ()), "µ", "k", "agents"),
         ("runs", "mean", "±", "expected", "z", "p corr."),
         tuple(rows),
     )
 
 
+def _sense(cell: Cell) -> str:
+    return cell.quantity if cell.quantity == "nees" else f"{cell.quantity} {cell.metric}"
+
+
 def crosscheck_csv(shown: CrosscheckView) -> str:
     """One line per cell."""
     rows = [
-        (c.link, c.step, _agents(c), c.runs, c.mean, c.error, c.expected, c.z, c.p, "agrees" if c.agrees else "differs")
+        (
+            c.link, c.step, _agents(c), c.runs, c.mean, c.error, c.expected, c.z, c.p,
+            "agrees" if c.agrees else "differs", c.quantity, c.metric, c.column, c.expected_error,
+        )
         for c in shown.verdict.cells
-    ]
-    headings = ("link", "step", "agents", "runs", "mean", "standard_error", "expected", "z", "p_corrected", "verdict")
+    ]  # fmt: skip
+    headings = (
+        "link", "step", "agents", "runs", "mean", "standard_error", "expected", "z", "p_corrected", "verdict",
+        "quantity", "metric", "column", "expected_standard_error",
+    )  # fmt: skip
     return to_csv(headings, rows)
 
 
 def crosscheck_json(shown: CrosscheckView) -> dict[str, Any]:
     """Return the object of schema stochfuse.crosscheck/1; a z-score that is infinite is null."""
-    p, v = shown.view.prediction, shown.verdict
+    v = shown.verdict
+    p = v.prediction
     return {
         "schema": SCHEMA,
         "version": __version__,
@@ -112,8 +162,9 @@ def crosscheck_json(shown: CrosscheckView) -> dict[str, Any]:
         "p_largest": v.p_largest,
         "p_together": v.p_together,
         "method": p.method,
-        "quantity": p.quantity,
-        "metric": shown.view.metric.name,
+        "estimator": p.estimator,
+        "quantity": shown.quantity,
+        "metric": shown.senses[0][1] if shown.senses else v.metric.name,
         "cells": [
             {
                 "link": _value(c.link),
@@ -126,12 +177,18 @@ def crosscheck_json(shown: CrosscheckView) -> dict[str, Any]:
                 "z": c.z if np.isfinite(c.z) else None,
                 "p_corrected": c.p,
                 "agrees": c.agrees,
+                "quantity": c.quantity,
+                "metric": c.metric,
+                "column": c.column,
+                "expected_standard_error": c.expected_error,
             }
             for c in v.cells
         ],
         "consistency": dict(v.consistency),
+        "evidence": list(v.evidence),
+        "causes": [cause if isinstance(cause, dict) else cause._asdict() for cause in v.causes],
         "scenario": p.scenario.to_mapping(),
-        "meta": {"description": list(shown.titles), "nature": p.nature, "notes": list(p.notes)},
+        "meta": {"description": list(shown.titles), "nature": p.nature, "notes": [*p.notes, *v.notes]},
     }
 
 
@@ -140,3 +197,109 @@ def _value(link: str) -> float | str:
         return float(link)
     except ValueError:
         return link
+
+
+def draw(shown: CrosscheckView) -> Any:
+    """Return the figure."""
+    from matplotlib.lines import Line2D
+
+    cells = shown.verdict.cells
+    panels: dict[tuple[str, str, str], list[Cell]] = {}
+    for cell in cells:
+        panels.setdefault((cell.quantity, cell.metric, _agents(cell)), []).append(cell)
+    kept = _worst(panels)
+    links = list(dict.fromkeys(cell.link for cell in cells))
+    chosen = [links[i] for i in spread(len(links))] if links else []
+    looks = {
+        link: {"color": color, "marker": MARKERS[i], "linestyle": DASHES[i]}
+        for i, (link, color) in enumerate(zip(chosen, shades(len(chosen)), strict=True))
+    }
+    across, down = min(ACROSS, len(kept) or 1), -(-len(kept) // ACROSS)
+    figure = figure_class()(figsize=(max(7.5, 1.2 + 3.6 * across), 4.4 + 2.7 * down), layout="constrained")
+    grid = figure.add_gridspec(1 + down, across, height_ratios=[1.15] + [1.0] * down)
+    said = _draw_scores(figure.add_subplot(grid[0, :]), shown, looks)
+    for place, key in enumerate(kept):
+        _draw_panel(figure.add_subplot(grid[1 + place // across, place % across]), shown, key, panels[key], looks)
+    below(
+        figure,
+        [
+            Line2D([], [], markersize=4, label=f"µ = {link}" if link else "simulator", **look)
+            for link, look in looks.items()
+        ],
+    )
+    left = [f"{len(kept)} of {len(panels)} panels, those with the largest |z|"] if len(kept) < len(panels) else []
+    left += [f"{len(chosen)} of {len(links)} link probabilities"] if len(chosen) < len(links) else []
+    lines = ["points: simulator, ± two standard errors; lines: expected", *said, *left]
+    view = shown.view("claimed", shown.verdict.metric.name)
+    titled(figure, shown.titles[0], view.whom.partition(";")[0], view.how, "; ".join(lines))
+    return figure
+
+
+def _worst(panels: dict[tuple[str, str, str], list[Cell]]) -> list[tuple[str, str, str]]:
+    """The panels that are drawn, in their order."""
+    keys = list(panels)
+    worst = sorted(keys, key=lambda key: -max(abs(cell.z) for cell in panels[key]))[:MOST_PANELS]
+    return [key for key in keys if key in worst]
+
+
+def _beside(cells: Sequence[Cell], place: int, places: int) -> np.ndarray:
+    """Steps, moved a little apart so that the marks of several link probabilities do not hide each other."""
+    return np.array([cell.step for cell in cells]) + 0.4 * ((place + 0.5) / places - 0.5)
+
+
+def _draw_scores(axes: Any, shown: CrosscheckView, looks: dict[str, dict[str, Any]]) -> list[str]:
+    """Draw z-scores, and return what is to be said of them."""
+    from matplotlib.ticker import MaxNLocator
+    from scipy.special import ndtri
+
+    v = shown.verdict
+    level = v.alpha / 2 if v.p_together is not None else v.alpha
+    limit = -float(ndtri(level / max(1, len(v.cells)) / 2))
+    finite = [abs(cell.z) for cell in v.cells if np.isfinite(cell.z)]
+    reach = max(LEAST_REACH, 1.25 * limit, 1.1 * min(max(finite, default=0.0), 6 * limit))
+    beyond = False
+    for place, (link, look) in enumerate(looks.items()):
+        mine = [cell for cell in v.cells if cell.link == link]
+        x, z = _beside(mine, place, len(looks)), np.array([cell.z for cell in mine])
+        outside = np.abs(z) > reach
+        beyond |= bool(outside.any())
+        style = {"color": look["color"], "linestyle": "none", "markersize": 4}
+        axes.plot(x[~outside], z[~outside], marker=look["marker"], **style)
+        for sign, mark in ((1, "^"), (-1, "v")):
+            far = outside & (np.sign(z) == sign)
+            axes.plot(x[far], np.full(far.sum(), 0.96 * sign * reach), marker=mark, markeredgecolor="0.1", **style)
+    axes.axhline(0.0, color="0.5", linewidth=0.8)
+    for sign in (1, -1):
+        axes.axhline(sign * limit, color="0.2", linewidth=0.8, linestyle="--")
+    axes.set_ylim(-reach, reach)
+    axes.set_ylabel("z, in standard errors", fontsize="small")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.grid(alpha=0.3)
+    said = [f"dashed: |z| = {limit:.2f}, reached by one of {counted(len(v.cells), 'cell')} with probability {level:g}"]
+    return [*said, "triangles: beyond the axis"] if beyond else said
+
+
+def _draw_panel(
+    axes: Any, shown: CrosscheckView, key: tuple[str, str, str], cells: Sequence[Cell], looks: dict[str, dict[str, Any]]
+) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    quantity, name, agents = key
+    for place, (link, look) in enumerate(looks.items()):
+        mine = sorted((cell for cell in cells if cell.link == link), key=lambda cell: cell.step)
+        if not mine:
+            continue
+        x = _beside(mine, place, len(looks))
+        axes.plot(x, [cell.expected for cell in mine], color=look["color"], linestyle=look["linestyle"], linewidth=1.2)
+        axes.errorbar(
+            x, [cell.mean for cell in mine], yerr=[2 * cell.error for cell in mine], color=look["color"],
+            marker=look["marker"], markersize=4, linestyle="none", capsize=2, linewidth=1,
+        )  # fmt: skip
+    who = f"agent {agents}" if agents.isdigit() else f"agents {agents}"
+    heading = "NEES" if quantity == "nees" else f"{quantity}, {name}"
+    axes.set_title(f"{heading}; {who}", fontsize="small")
+    axes.set_ylabel("NEES" if quantity == "nees" else shown.view(quantity, name).axis, fontsize="small")
+    axes.set_xlabel("step k", fontsize="small")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.tick_params(labelsize="small")
+    axes.grid(alpha=0.3)

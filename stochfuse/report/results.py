@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from typing import Any
 
+from stochfuse.data.crosscheck import Verdict
 from stochfuse.errors import UsageError, needed
 from stochfuse.estimators.fusion_graph import FusionGraph
 from stochfuse.kalman.metrics import metric
@@ -17,7 +18,16 @@ from stochfuse.questions.least_link import LeastLink
 from stochfuse.questions.least_value import LeastValue
 from stochfuse.questions.messages import MessageLoad, SweptLoad
 from stochfuse.questions.sensitivity import Sensitivity, ShareOfGain
-from stochfuse.report import comparisons, fusion_graph, links, messages, predictions, solutions, study_figures
+from stochfuse.report import (
+    comparisons,
+    crosschecks,
+    fusion_graph,
+    links,
+    messages,
+    predictions,
+    solutions,
+    study_figures,
+)
 from stochfuse.report.critical import critical_report
 from stochfuse.report.plot import figure_class
 from stochfuse.report.predictions import PredictionView
@@ -54,6 +64,8 @@ def report_of(result: Any, of: str | None = None, agent: int | str = "mean") -> 
         return study_figures.summary_report(result, 5)
     if isinstance(result, Links):
         return links.links_report(result)
+    if isinstance(result, Verdict):
+        return crosschecks.crosscheck_report(crosschecks.CrosscheckView(result))
     scenario = (result if isinstance(result, Prediction | Swept) else result.predictions[0]).scenario
     chosen = metric(of or scenario.metric or "trace", scenario.model)
     if isinstance(result, EstimatorComparison):
