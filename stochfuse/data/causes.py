@@ -28,11 +28,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
-from math import log
-from typing import Any, NamedTuple
+from math import log, log1p
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from stochfuse.data.blocks import blocks_of
 from stochfuse.data.mistakes import DEPENDENT, MISTAKES, WRONG_LINK, Mistake, Variant
 from stochfuse.data.supposed import CLAIMED, ERROR, SQUARED, Block, Cell, Sampler, Simulator
 from stochfuse.engines.distribution import Distribution
@@ -42,6 +43,9 @@ from stochfuse.prediction.result import Prediction
 from stochfuse.scenario.network import LinkRows, uniform_rows
 from stochfuse.scenario.registry import BROADCAST_PRIOR, LFG
 from stochfuse.scenario.system import System
+
+if TYPE_CHECKING:
+    from stochfuse.data.crosscheck import Verdict
 
 ALPHA = 0.001
 ROUGHLY, CLOSELY = 400, 4000
@@ -83,7 +87,9 @@ class Cause(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """How well some numbers explain the results: T², freedom, p, how far cells are off, and the largest |z|."""
+    """How well some numbers explain the results: T², freedom, p, how far cells are off, the largest |z|, and of how
+    many cells nothing is said.
+    """
 
     distance: float
     freedom: int
@@ -91,6 +97,7 @@ class _Fit(NamedTuple):
     off: float
     largest: float
     where: str
+    untold: int
 
 
 class _Means(NamedTuple):
@@ -128,7 +135,6 @@ def diagnose(
     blocks: Sequence[Block],
     *,
     alpha: float = ALPHA,
-    resolution: float = 0.0,
 ) -> tuple[Cause, ...]:
     """Say what would explain results that disagree with a prediction.
 
@@ -138,7 +144,6 @@ def diagnose(
     rows : links that it was asked for.
     blocks : the results, one block for each link probability.
     alpha : probability that the right cause is said not to explain.
-    resolution : half a unit of the last digit of the results' numbers.
 
     Returns
     -------
@@ -150,7 +155,9 @@ def diagnose(
     UsageError
         If blocks name rows or agents that the prediction does not have.
     """
-    return _Diagnosis(prediction, *_fewer(prediction, rows, blocks), alpha, resolution).causes()
+    if not blocks or not any(block.cells for block in blocks):
+        return ()
+    return _Diagnosis(prediction, *_fewer(prediction, rows, blocks), alpha).causes()
 
 
 def _fewer(
@@ -174,13 +181,25 @@ def _fewer(
     return chosen, prediction.scenario.until(last).system, tuple(block for block in found if block.cells)
 
 
+def causes_of(verdict: Verdict, rows: LinkRows) -> tuple[Cause, ...]:
+    """Say what would explain a verdict that disagrees; empty where it agrees.
+
+    Parameters
+    ----------
+    rows : links that its prediction was asked for.
+    """
+    return () if verdict.agrees else diagnose(verdict.prediction, rows, blocks_of(verdict), alpha=verdict.alpha)
+
+
 def summary(causes: Sequence[Cause]) -> str:
     """Return in one line what was found."""
     explaining = [c for c in causes if c.explains]
     if explaining:
-        others = f"; so do {', '.join(c.cause for c in explaining[1:])}" if len(explaining) > 1 else ""
-        two = "two faults: " if len(explaining[0].of) > 1 else ""
-        return f"likely cause: {two}{' and '.join(explaining[0].of)} explains the numbers{others}"
+        first, others = explaining[0], [c.cause for c in explaining[1:]]
+        so = f"; so {'does' if len(others) == 1 else 'do'} {', '.join(others)}" if others else ""
+        if len(first.of) > 1:
+            return f"likely cause: two faults, {' and '.join(first.of)}, together explain the numbers{so}"
+        return f"likely cause: {first.cause} explains the numbers{so}"
     known = len(MISTAKES) + 2
     if not causes:
         return f"none of the {known} known mistakes can be tried on this scenario"
@@ -198,7 +217,6 @@ class _Diagnosis:
     system: System
     blocks: tuple[Block, ...]
     alpha: float
-    resolution: float
 
     def causes(self) -> tuple[Cause, ...]:
         """All of it."""
@@ -238,8 +256,8 @@ class _Diagnosis:
     def expected(self) -> _Means:
         """What the prediction expects."""
         mean = [np.array([cell.expected for cell in block.cells]) for block in self.blocks]
-        nothing = [np.zeros((len(m), len(m))) for m in mean]
-        return _Means(mean, nothing, nothing)
+        noise = [np.diag([cell.expected_error**2 for cell in block.cells]) for block in self.blocks]
+        return _Means(mean, noise, [np.zeros_like(m) for m in noise])
 
     def _singles(self, trial: _Trial) -> list[_Tried]:
         found = []
@@ -287,7 +305,8 @@ class _Diagnosis:
         two = "two faults: " if len(names) > 1 else ""
         left = f"largest |z| {t.fit.largest:.3g} at {t.fit.where}"
         how = f"explains all but p = {t.fit.p:.2g}" if self._explains(t) else f"does not explain (p = {t.fit.p:.2g})"
-        text = f"{' and '.join(names)}: {two}{what}; {how}, {left}"
+        untold = f"; of {t.fit.untold} cells it says nothing" if t.fit.untold else ""
+        text = f"{' and '.join(names)}: {two}{what}; {how}, {left}{untold}"
         return Cause(
             cause="+".join(names),
             explains=self._explains(t),
@@ -305,10 +324,14 @@ class _Diagnosis:
         ----------
         runs : per block, number of runs that are as good as independent; default: all.
         """
-        distance, freedom, exact, off, largest, where = 0.0, 0, 0, 0.0, -1.0, ""
+        distance, freedom, exact, off, largest, where, untold = 0.0, 0, 0, 0.0, -1.0, "", 0
         for b, block in enumerate(self.blocks):
             r, C = np.array([cell.mean for cell in block.cells]) - means.mean[b], means.noise[b]
             known, floor = np.flatnonzero(~np.isnan(r)), self._floor(b)
+            # cells of which a mistake says nothing are as far off as they were
+            wrong = [cell for cell, unknown in zip(block.cells, np.isnan(r), strict=True) if unknown]
+            untold += len(wrong)
+            off += sum(log1p(((c.mean - c.expected) / c.error) ** 2) for c in wrong if c.error > 0)
             if not len(known):
                 continue
             C = (self._covariance(b, means.spread[b], runs) + C)[np.ix_(known, known)]
@@ -328,14 +351,15 @@ class _Diagnosis:
         from scipy.special import chdtrc
 
         left = max(freedom - (0 if exact else estimated), 1)
-        return _Fit(distance, left, float(chdtrc(left, distance)), off, largest, where)
+        return _Fit(distance, left, float(chdtrc(left, distance)), off, largest, where, untold)
 
     def _sample(self, b: int, runs: Sequence[float] | None) -> float:
         return float(runs[b]) if runs is not None else float(min(cell.runs for cell in self.blocks[b].cells))
 
     def _floor(self, b: int) -> np.ndarray:
         means = np.array([cell.mean for cell in self.blocks[b].cells])
-        return self.resolution + ROUNDING * np.maximum(np.abs(means), 1e-300)
+        given = np.array([cell.resolution for cell in self.blocks[b].cells])
+        return given + ROUNDING * np.maximum(np.abs(means), 1e-300)
 
     def _covariance(self, b: int, spread: np.ndarray, runs: Sequence[float] | None) -> np.ndarray:
         """Covariance of a block's means: the runs' own, where they vary; else that of the simulator supposed."""
@@ -452,7 +476,7 @@ class _Trial:
         except (StochfuseError, np.linalg.LinAlgError):
             return None
         mean, noise, spread = [], [], []
-        exact = d.prediction.nature in ("exact", "sampled")
+        exact = d.prediction.nature == "exact"
         for X, Z, expected in zip(shown, self._right, d.expected.mean, strict=True):
             unknown = np.isnan(X).all(axis=0)
             if not np.isfinite(X[:, ~unknown]).all():

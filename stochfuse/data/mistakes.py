@@ -246,6 +246,20 @@ def _architecture(s: Simulator) -> Iterator[Variant]:
             yield _certain(_network(s, architecture=architecture))
 
 
+def _agents(s: Simulator) -> Iterator[Variant]:
+    system, n = s.system, s.system.agents
+    alike = len(set(system.labels)) == 1 and s.rows.uniform and s.rows.bursts is None and not s.whose
+    if not alike or not system.one_state or system.noise is not None or system.network.hears is not None:
+        return
+    for m in (n - 1, n + 1):
+        if m >= 1 and system.network.delays is None:
+            other = replace(
+                _network(s, agents=m).system, sensor_of=system.sensor_of[:1] * m, labels=system.labels[:1] * m
+            )
+            # one stands for all, since they are alike
+            yield _certain(replace(s, system=other, whose=(1,) * n))
+
+
 def _links(s: Simulator, of: Callable[[np.ndarray], np.ndarray]) -> Iterator[Variant]:
     if s.system.agents > 1 and s.rows.bursts is None:
         there = s.rows.link > 0 if s.rows.link.ndim > 2 else np.ones(1, dtype=bool)
@@ -387,6 +401,26 @@ def _no_noise(s: Simulator) -> Iterator[Variant]:
         yield from _changed(s, lambda system: scaled(system, Q=0.0))
 
 
+def _no_error(s: Simulator) -> Iterator[Variant]:
+    if s.followed and s.system.error is not None and s.system.error.any():
+        yield _certain(replace(s, system=replace(s.system, error=None)))
+
+
+def _other_sign(s: Simulator) -> Iterator[Variant]:
+    if s.followed and s.system.error is not None and s.system.error.any():
+        yield _certain(replace(s, system=replace(s.system, error=-s.system.error)))
+
+
+def _with_error(s: Simulator) -> Iterator[Variant]:
+    if s.followed and s.system.dimension == 1 and s.system.one_state:
+        deviation = np.sqrt(s.system.P0)
+        yield Variant(
+            lambda at: replace(s, system=replace(s.system, error=at * deviation)),
+            (-10.0, -3.0, -1.0, -0.3, 0.3, 1.0, 3.0, 10.0),
+            lambda at: at * float(deviation[0, 0]),
+        )
+
+
 def _per_root(s: Simulator) -> Iterator[Variant]:
     yield from _shown(
         s,
@@ -496,7 +530,11 @@ MISTAKES = (
         "the covariance of the first estimates is {0:.3g} times that of the scenario",
         lambda s: _scaled(s, "P0"),
     ),
+    Mistake("initial-error-left-out", "the known initial error (initial.error) is left out", _no_error),
+    Mistake("sign-of-error", "errors have the other sign: truth less estimate", _other_sign),
+    Mistake("initial-error", "the first estimates are off by {0:.3g} on average", _with_error),
     Mistake("F-transposed", "F is transposed", _transposed),
+    Mistake("wrong-number-of-agents", "there is an agent more, or one less", _agents),
     Mistake("wrong-architecture", "who hears whom is drawn by another architecture", _architecture),
     Mistake("silent-at-step-1", "nothing is exchanged at step 1", _silent_at_first),
     Mistake("link-transposed", "receiver and sender are exchanged in the matrix of links", _turned),

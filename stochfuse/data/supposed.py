@@ -57,6 +57,8 @@ class Cell(NamedTuple):
     runs : independent runs.
     mean, error : what the file has, and its standard error.
     expected : prediction.
+    resolution : half a unit of the last digit that the file gives.
+    expected_error : standard error of what is expected, 0 where it is not sampled.
     """
 
     quantity: str
@@ -67,6 +69,8 @@ class Cell(NamedTuple):
     mean: float
     error: float
     expected: float
+    resolution: float = 0.0
+    expected_error: float = 0.0
 
 
 class Block(NamedTuple):
