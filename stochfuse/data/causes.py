@@ -8,7 +8,8 @@ results' means x̄ and the covariance C of these, from the runs themselves, over
 where C_m is how far the sample behind m is known: m = expected + mean of (what the mistaken simulator shows − what the
 right one shows), over the same histories where that is closer than what it shows by itself.  Links are independent; the
 T² of each becomes a χ² of equal probability, and these add up.  Cells that do not vary have to be met to their digits.
-A mistake explains the results if p is above the crosscheck's level.
+A mistake explains the results if p is above the crosscheck's level, and no other one that does so spreads the runs far
+more as they are.
 
 The likeliest comes first: of those that explain, by T² plus the logarithm of the number of runs for every number that
 was estimated (Schwarz), plus how unlike the runs of each cell are spread (4 λ² of Kolmogorov and Smirnov's λ of two
@@ -29,13 +30,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 from math import log, log1p
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from stochfuse.data.blocks import blocks_of
 from stochfuse.data.mistakes import DEPENDENT, MISTAKES, WRONG_LINK, Mistake, Variant
-from stochfuse.data.supposed import CLAIMED, ERROR, SQUARED, Block, Cell, Sampler, Simulator
+from stochfuse.data.supposed import CLAIMED, ERROR, SQUARED, Block, Cell, Sampler, Simulator, exactly
 from stochfuse.engines.distribution import Distribution
 from stochfuse.engines.progress import listener
 from stochfuse.errors import StochfuseError
@@ -56,8 +57,13 @@ NEAREST, PAIRED, LISTED = 6, 6, 8
 """Mistakes that are looked at closely, those tried in pairs, and causes named that do not explain."""
 LINKS, CELLS, STEPS = 4, 60, (8, 8, 4, 3)
 """Links, cells of a link, and first steps, of 1, 2, 3 and more agents, that are looked at."""
-BETTER, MOST_APART = 6.0, 100.0
-"""Least gain in T² over a right simulator; most that the spread of one cell counts."""
+BETTER, MOST_APART, SPREAD = 6.0, 100.0, 40.0
+"""Least gain in T² over a right simulator; most that the spread of one cell counts, and most by which that of all may
+be worse than another mistake's."""
+CLOSE, FIRM = 0.01, 1e-6
+"""Gain in T² that ends a search; share of a direction's variance below which it is rounding."""
+DIFFERENT = 0.95
+"""Share of runs with noise of their own below which runs are repeated."""
 ROUNDING = 1e-6
 """Relative difference of cells that do not vary which is rounding."""
 APPROXIMATE = "approximate-prediction"
@@ -117,6 +123,7 @@ class _Tried(NamedTuple):
     at : number that was estimated, where one was, in the variant's own terms.
     numbers : how many were.
     apart : how unlike the runs are spread, as a χ².
+    refuted : whether the runs are spread far more like those of another mistake that has the same means.
     shown : the numbers in words; empty: `at`.
     """
 
@@ -126,6 +133,7 @@ class _Tried(NamedTuple):
     at: float = 0.0
     numbers: int = 0
     apart: float = 0.0
+    refuted: bool = False
     shown: str = ""
 
 
@@ -227,7 +235,8 @@ class _Diagnosis:
         if not any(self._explains(t) for t in best):
             best += self._closer(self._pairs(rough, tried))
         best = [t for t in best if not self._explains(t) or t.fit.distance < nothing - BETTER]
-        ranked = sorted(best, key=self._rank)
+        least = min((t.apart for t in best if self._explains(t)), default=0.0)
+        ranked = sorted((t._replace(refuted=t.apart > least + SPREAD) for t in best), key=self._rank)
         explaining = sum(map(self._explains, ranked))
         return tuple(map(self._cause, ranked[: max(LISTED, explaining)]))
 
@@ -280,7 +289,7 @@ class _Diagnosis:
     def _closer(self, tried: Sequence[_Tried]) -> list[_Tried]:
         """The same, of larger samples where that may decide."""
         near = [t for t in tried if t.fit.p > WORTH][:NEAREST]
-        trial, out = _Trial(self, min(CLOSELY, 2 * max(self.runs, ROUGHLY))), []
+        trial, out = _Trial(self, min(CLOSELY, 2 * max(self.runs, ROUGHLY)), exactly=True), []
         for t in tried:
             variants = [t.variant] if t in near and t.variant is not None else []
             # a search that has found something begins anew around it
@@ -290,7 +299,7 @@ class _Diagnosis:
         return out
 
     def _explains(self, t: _Tried) -> bool:
-        return t.fit.p > self.alpha
+        return t.fit.p > self.alpha and not t.refuted
 
     def _rank(self, t: _Tried) -> tuple[float, ...]:
         price = log(max(2, self.runs)) * (t.numbers + len(t.mistakes) - 1)
@@ -302,9 +311,14 @@ class _Diagnosis:
         names = tuple(m.name for m in t.mistakes)
         seen = t.at if t.variant is None else t.variant.shown(t.at)
         what = " and ".join(m.text.format(t.shown or seen) for m in t.mistakes)
+        what += f" ({t.variant.note})" if t.variant is not None and t.variant.note else ""
         two = "two faults: " if len(names) > 1 else ""
         left = f"largest |z| {t.fit.largest:.3g} at {t.fit.where}"
-        how = f"explains all but p = {t.fit.p:.2g}" if self._explains(t) else f"does not explain (p = {t.fit.p:.2g})"
+        how = f"explains all but p = {t.fit.p:.2g}"
+        if t.refuted:
+            how = f"explains the means (p = {t.fit.p:.2g}), not how the runs are spread"
+        elif not self._explains(t):
+            how = f"does not explain (p = {t.fit.p:.2g})"
         untold = f"; of {t.fit.untold} cells it says nothing" if t.fit.untold else ""
         text = f"{' and '.join(names)}: {two}{what}; {how}, {left}{untold}"
         return Cause(
@@ -353,6 +367,19 @@ class _Diagnosis:
         left = max(freedom - (0 if exact else estimated), 1)
         return _Fit(distance, left, float(chdtrc(left, distance)), off, largest, where, untold)
 
+    def scales(self, means: _Means) -> list[np.ndarray]:
+        """Matrix W of every block, such that |W r|² is about the T² of a difference r from means like these."""
+        found = []
+        for b in range(len(self.blocks)):
+            C, floor = self._covariance(b, means.spread[b], None) + means.noise[b], self._floor(b)
+            deviation = np.maximum(np.sqrt(np.maximum(np.diagonal(C), 0.0)), floor)
+            correlation = C / np.outer(deviation, deviation)
+            np.fill_diagonal(correlation, 1.0)
+            values, vectors = np.linalg.eigh(np.nan_to_num(correlation))
+            firm = values > FIRM
+            found.append((vectors[:, firm] / np.sqrt(values[firm])).T / deviation)
+        return found
+
     def _sample(self, b: int, runs: Sequence[float] | None) -> float:
         return float(runs[b]) if runs is not None else float(min(cell.runs for cell in self.blocks[b].cells))
 
@@ -386,9 +413,8 @@ class _Diagnosis:
         for b, block in enumerate(self.blocks):
             for i, cell in enumerate(block.cells):
                 if block.values is not None and means.shown is not None and cell.quantity == CLAIMED:
-                    X = means.shown[b][:, i] + (means.mean[b][i] - means.shown[b][:, i].mean())
                     slack = 4.0 * cell.error + self._floor(b)[i]
-                    total += min(MOST_APART, _unlike(block.values[:, i], X, slack))
+                    total += min(MOST_APART, _unlike(block.values[:, i], means.shown[b][:, i], slack))
         return total
 
     @cached_property
@@ -426,7 +452,7 @@ class _Diagnosis:
         rows = uniform_rows([µ for µ, _ in found])
         means = trial.means(replace(self.base, rows=rows))
         apart = 0.0 if means is None else self.apart(means)
-        return _Tried((mistake,), None, fit, found[0][0], len(found), apart, shown)
+        return _Tried((mistake,), None, fit, found[0][0], len(found), apart, False, shown)
 
     def _alone(self, b: int, mean: np.ndarray, nothing: np.ndarray) -> float:
         alone = replace(self, blocks=self.blocks[b : b + 1])
@@ -441,6 +467,12 @@ class _Diagnosis:
         for block, spread in zip(self.blocks, means.spread, strict=True):
             n = float(min(cell.runs for cell in block.cells))
             found = None if block.values is None else independent_runs(block.values, vary=bool(spread.any()))
+            noisy = [i for i, cell in enumerate(block.cells) if cell.quantity != CLAIMED]
+            if block.values is not None and noisy:
+                # noise that is the same to the last digit was drawn once
+                once = len(np.unique(block.values[:, noisy], axis=0))
+                if once < DIFFERENT * len(block.values):
+                    found = min(once, found or np.inf)
             dependent |= found is not None
             effective.append(n if found is None else found)
         if not dependent:
@@ -448,7 +480,7 @@ class _Diagnosis:
         fit = self.judge(means._replace(mean=self.expected.mean, noise=self.expected.noise), runs=effective)
         text = "the runs are not independent of each other, and tell no more than about {0} that are"
         shown = f"{min(effective):.3g}"
-        return _Tried((Mistake(DEPENDENT, text, lambda _: iter(())),), None, fit, min(effective), 1, 0.0, shown)
+        return _Tried((Mistake(DEPENDENT, text, lambda _: iter(())),), None, fit, min(effective), 1, 0.0, False, shown)
 
     def _approximate(self, trial: _Trial) -> _Tried | None:
         if self.prediction.nature not in ("approximate", "bound"):
@@ -458,10 +490,10 @@ class _Diagnosis:
 
 
 class _Trial:
-    """Tries simulators with samples of one size."""
+    """Tries simulators with samples of one size, and exactly where that is asked for and can be had."""
 
-    def __init__(self, diagnosis: _Diagnosis, runs: int) -> None:
-        self.diagnosis = diagnosis
+    def __init__(self, diagnosis: _Diagnosis, runs: int, *, exactly: bool = False) -> None:
+        self.diagnosis, self.exactly = diagnosis, exactly
         self.sampler = Sampler(runs, errors=diagnosis.errors)
         self._right: list[np.ndarray] | None = None
 
@@ -476,22 +508,33 @@ class _Trial:
         except (StochfuseError, np.linalg.LinAlgError):
             return None
         mean, noise, spread = [], [], []
-        exact = d.prediction.nature == "exact"
-        for X, Z, expected in zip(shown, self._right, d.expected.mean, strict=True):
+        outright = self.exact(simulator)
+        difference = d.prediction.nature == "exact"
+        for b, (X, Z, expected) in enumerate(zip(shown, self._right, d.expected.mean, strict=True)):
             unknown = np.isnan(X).all(axis=0)
             if not np.isfinite(X[:, ~unknown]).all():
                 return None
             X = np.where(unknown, Z, X)
-            D, own = X - Z, _covariance_of(X)
-            apart = _covariance_of(D)
+            own, apart = _covariance_of(X), _covariance_of(X - Z)
             # cells of unlike sizes count alike
             scale = np.where(np.diagonal(own) > 0, np.diagonal(own), 1.0)
-            closer = exact and (np.diagonal(apart) / scale).sum() < (np.diagonal(own) / scale).sum() + 1e-300
-            closer = closer or (exact and not apart.any())
-            mean.append(np.where(unknown, np.nan, expected + D.mean(axis=0) if closer else X.mean(axis=0)))
-            noise.append((apart if closer else own) / len(X))
+            closer = difference and (np.diagonal(apart) / scale).sum() <= (np.diagonal(own) / scale).sum()
+            of_sample = expected + (X - Z).mean(axis=0) if closer else X.mean(axis=0)
+            mean.append(np.where(unknown, np.nan, of_sample) if outright is None else outright[b])
+            noise.append(np.zeros_like(own) if outright is not None else (apart if closer else own) / len(X))
             spread.append(own)
         return _Means(mean, noise, spread, shown)
+
+    def exact(self, simulator: Simulator) -> list[np.ndarray] | None:
+        """What a simulator shows on average, where that is asked for and can be had."""
+        if not self.exactly:
+            return None
+        try:
+            with np.errstate(all="ignore"):
+                found = exactly(simulator, self.diagnosis.blocks)
+        except (StochfuseError, np.linalg.LinAlgError):
+            return None
+        return found if found is None or all(np.isfinite(m).all() for m in found) else None
 
     def best(self, mistakes: tuple[Mistake, ...], variants: Iterator[Variant] | Sequence[Variant]) -> _Tried | None:
         """The variant that comes closest to the results."""
@@ -509,49 +552,47 @@ class _Trial:
                 points[at] = means
         if len(points) < 3:
             return None
-        judge = self.diagnosis.judge
+        distance = {at: self.diagnosis.judge(means, 1).distance for at, means in points.items()}
         for _ in range(8):
-            best = min(points, key=lambda at: judge(points[at], 1).distance)
-            new = _lowest(points, best, judge)
-            if new is None or min(abs(new - at) for at in points) < 1e-9:
+            best = min(distance, key=distance.__getitem__)
+            new = self._lowest(points, best)
+            if min(abs(new - at) for at in points) < 1e-9:
                 break
             means = self.means(variant.of(new))
             if means is None:
                 break
-            points[new] = means
-        best = min(points, key=lambda at: judge(points[at], 1).distance)
+            points[new], distance[new] = means, self.diagnosis.judge(means, 1).distance
+            if 0 <= distance[best] - distance[new] < CLOSE:
+                break
+        best = min(distance, key=distance.__getitem__)
         return self._tried(mistakes, variant, points[best], best)
+
+    def _lowest(self, points: dict[float, _Means], best: float) -> float:
+        """Where the cells' parabolas through three points come closest to the results, near the best of these."""
+        a, b, c = sorted(sorted(points, key=lambda at: abs(at - best))[:3])
+        low, high = a - (b - a) / 2 - b, c + (c - b) / 2 - b
+        quartic = np.zeros(5)
+        for block, W in enumerate(self.diagnosis.scales(points[best])):
+            at_a, at_b, at_c = (points[at].mean[block] for at in (a, b, c))
+            # Newton's form about b: m = m_b + s u + q u²
+            left, right = (at_b - at_a) / (b - a), (at_c - at_b) / (c - b)
+            q = (right - left) / (c - a)
+            s = left + q * (b - a)
+            r = np.array([cell.mean for cell in self.diagnosis.blocks[block].cells]) - at_b
+            known = ~np.isnan(r)
+            terms = [W[:, known] @ x[known] for x in (-q, -s, r)]
+            for i, one in enumerate(terms):
+                for j, other in enumerate(terms):
+                    quartic[i + j] += one @ other
+        roots = np.roots(np.polyder(quartic))
+        inside = [low, high, *(x.real for x in roots if abs(x.imag) < 1e-9 and low < x.real < high)]
+        return float(b + min(inside, key=lambda u: np.polyval(quartic, u)))
 
     def _tried(self, mistakes: tuple[Mistake, ...], variant: Variant, means: _Means, at: float = 0.0) -> _Tried:
         d, numbers = self.diagnosis, int(bool(variant.grid))
         fit = d.judge(means, numbers)
         apart = d.apart(means) if fit.p > WORTH else 0.0
         return _Tried(mistakes, variant, fit, at, numbers, apart)
-
-
-def _lowest(points: dict[float, _Means], best: float, judge: Callable[..., _Fit]) -> float | None:
-    """Where the cells' parabolas through three points come closest to the results, near the best of these."""
-    three = sorted(sorted(points, key=lambda at: abs(at - best))[:3])
-    a, b, c = three
-    low, high = a - (b - a) / 2, c + (c - b) / 2
-    means = [points[at] for at in three]
-
-    def distance(at: float) -> float:
-        w = (
-            (at - b) * (at - c) / ((a - b) * (a - c)),
-            (at - a) * (at - c) / ((b - a) * (b - c)),
-            (at - a) * (at - b) / ((c - a) * (c - b)),
-        )
-        mean = [sum(x * m.mean[i] for x, m in zip(w, means, strict=True)) for i in range(len(means[0].mean))]
-        return judge(points[best]._replace(mean=mean), 1).distance
-
-    from scipy.optimize import minimize_scalar
-
-    grid = np.linspace(low, high, 9)
-    near = int(np.argmin([distance(at) for at in grid]))
-    bounds = (grid[max(0, near - 1)], grid[min(8, near + 1)])
-    found: Any = minimize_scalar(distance, bounds=bounds, method="bounded", options={"xatol": 1e-10 * (high - low)})
-    return float(found.x)
 
 
 def _unlike(one: np.ndarray, other: np.ndarray, slack: float) -> float:
@@ -597,7 +638,7 @@ def _hotelling(r: np.ndarray, C: np.ndarray, runs: float) -> tuple[float, int]:
     # few runs know less of a correlation than of a deviation
     shrink = min(1.0, len(r) / max(runs, 1.0))
     values, vectors = np.linalg.eigh((1.0 - shrink) * correlation + shrink * np.eye(len(r)))
-    firm = values > 1e-6
+    firm = values > FIRM
     T = float((((vectors.T @ (r / deviation))[firm]) ** 2 / values[firm]).sum())
     d = int(firm.sum())
     if runs <= d + 2:
@@ -670,9 +711,10 @@ def independent_runs(values: np.ndarray, *, vary: bool = True) -> float | None:
     X = X[:, moving] / scale[moving]
     size = 1 << (2 * n - 1).bit_length()
     power = np.abs(np.fft.rfft(X, size, axis=0)) ** 2
-    ρ = np.fft.irfft(power.mean(axis=1), size)[: n // 2] / n
+    left = np.arange(n, 10, -1)
+    ρ = np.fft.irfft(power.mean(axis=1), size)[: len(left)] / left
     # cells hang together, so that their average is taken to be as uncertain as one of them
-    lags = np.flatnonzero(np.abs(ρ[1:]) > 6.0 / np.sqrt(n - np.arange(1, len(ρ)))) + 1
+    lags = np.flatnonzero(np.abs(ρ[1:]) > 6.0 / np.sqrt(left[1:])) + 1
     if not len(lags):
         return None
     inflation = 1.0 + 2.0 * float(((1.0 - lags / n) * ρ[lags]).sum())

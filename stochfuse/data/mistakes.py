@@ -39,6 +39,9 @@ MEMORY = (0.3, 0.6, 0.9)
 """Correlation of a link's states from step to step at which a search begins."""
 FROZEN = 1e-9
 """Probability that a link which is drawn once changes in a step."""
+LONG = 0.8
+"""Correlation of a link's states where it is what they deliver that is estimated."""
+FILTERS, CLAIMS = "in the filters alone", "in what is claimed alone"
 
 
 class Variant(NamedTuple):
@@ -49,11 +52,13 @@ class Variant(NamedTuple):
     of : the simulator, of the unknown number if there is one.
     grid : values of it where a search for the right one begins; empty if there is none.
     shown : what a person sees of it.
+    note : which way it is, where there are several; may be empty.
     """
 
     of: Callable[[float], Simulator]
     grid: tuple[float, ...] = ()
     shown: Callable[[float], float] = float
+    note: str = ""
 
 
 class Mistake(NamedTuple):
@@ -71,8 +76,8 @@ class Mistake(NamedTuple):
     variants: Callable[[Simulator], Iterator[Variant]]
 
 
-def _certain(simulator: Simulator) -> Variant:
-    return Variant(lambda _: simulator)
+def _certain(simulator: Simulator, note: str = "") -> Variant:
+    return Variant(lambda _: simulator, note=note)
 
 
 def _numbers(s: Simulator, make: Callable[[System, float], System]) -> Iterator[Variant]:
@@ -86,13 +91,13 @@ def _numbers(s: Simulator, make: Callable[[System, float], System]) -> Iterator[
 
     yield Variant(whole, SCALES, np.exp)
     if s.followed and s.estimator in SUMS:
-        yield Variant(believed, SCALES, np.exp)
+        yield Variant(believed, SCALES, np.exp, FILTERS)
 
 
 def _changed(s: Simulator, make: Callable[[System], System]) -> Iterator[Variant]:
     yield _certain(replace(s, system=make(s.system)))
     if s.followed and s.estimator in SUMS:
-        yield _certain(replace(s, told=make(s.told or s.system)))
+        yield _certain(replace(s, told=make(s.told or s.system)), FILTERS)
 
 
 def scaled(system: System, *, Q: float = 1.0, R: float = 1.0, P0: float = 1.0) -> System:
@@ -121,11 +126,12 @@ def _concerned(s: Simulator) -> tuple[bool, ...]:
 
 
 def _stage(s: Simulator, stage: str) -> Iterator[Variant]:
-    if not s.system.one_state or s.stage == stage or s.shift:
+    if not s.system.one_state or s.stage == stage or s.shift or (stage == LOCAL and s.system.detects is not None):
         return
     for from_start in (True, False):
         for claimed in _concerned(s):
-            yield _certain(replace(s, stage=stage, from_start=from_start, claimed_only=claimed))
+            note = CLAIMS if claimed else ""
+            yield _certain(replace(s, stage=stage, from_start=from_start, claimed_only=claimed), note)
 
 
 def _shifted(s: Simulator) -> Iterator[Variant]:
@@ -133,11 +139,13 @@ def _shifted(s: Simulator) -> Iterator[Variant]:
         return
     for claimed in _concerned(s):
         for from_start in (True, False):
-            yield _certain(replace(s, shift=-1, from_start=from_start, claimed_only=claimed))
+            note = "the step before" + (f", {CLAIMS}" if claimed else "")
+            yield _certain(replace(s, shift=-1, from_start=from_start, claimed_only=claimed), note)
     longer = one_step_more(s)
     if longer is not None:
         for claimed in _concerned(s):
-            yield _certain(replace(longer, shift=1, claimed_only=claimed))
+            note = "the step after" + (f", {CLAIMS}" if claimed else "")
+            yield _certain(replace(longer, shift=1, claimed_only=claimed), note)
 
 
 def one_step_more(s: Simulator, first: bool = False) -> Simulator | None:
@@ -243,7 +251,7 @@ def _architecture(s: Simulator) -> Iterator[Variant]:
         return
     for architecture in ARCHITECTURES:
         if architecture != network.architecture and network.delays is None:
-            yield _certain(_network(s, architecture=architecture))
+            yield _certain(_network(s, architecture=architecture), architecture)
 
 
 def _agents(s: Simulator) -> Iterator[Variant]:
@@ -257,7 +265,7 @@ def _agents(s: Simulator) -> Iterator[Variant]:
                 _network(s, agents=m).system, sensor_of=system.sensor_of[:1] * m, labels=system.labels[:1] * m
             )
             # one stands for all, since they are alike
-            yield _certain(replace(s, system=other, whose=(1,) * n))
+            yield _certain(replace(s, system=other, whose=(1,) * n), f"{m} agents")
 
 
 def _links(s: Simulator, of: Callable[[np.ndarray], np.ndarray]) -> Iterator[Variant]:
@@ -301,6 +309,22 @@ def with_memory(rows: LinkRows, memory: float) -> LinkRows:
 def _bursts(s: Simulator) -> Iterator[Variant]:
     if _may_have_memory(s):
         yield Variant(lambda memory: replace(s, rows=with_memory(s.rows, min(max(memory, 0.0), 1.0))), MEMORY)
+        # the correlation from step to step of deliveries is that of the states times the square of the contrast
+        yield Variant(
+            lambda contrast: replace(s, rows=_with_contrast(s.rows, min(max(contrast, 0.0), 1.0))),
+            MEMORY,
+            lambda contrast: LONG * contrast**2,
+            "between better and worse",
+        )
+
+
+def _with_contrast(rows: LinkRows, contrast: float) -> LinkRows:
+    """Return rows whose links are better and worse for a while, each half of the time."""
+    leave, bursts = (1.0 - LONG) / 2, []
+    for µ in rows.link.tolist():
+        spread = contrast * min(µ, 1.0 - µ)
+        bursts.append(None if not 0 < µ < 1 else np.array([leave, leave, µ + spread, µ - spread]))
+    return replace(rows, bursts=tuple(bursts))
 
 
 def _drawn_once(s: Simulator) -> Iterator[Variant]:
@@ -353,25 +377,29 @@ def _constant(numbers: np.ndarray, cell: Cell, s: Simulator, *, which: str) -> n
     return np.full_like(numbers, float(value))
 
 
+def _noise(s: Simulator) -> Iterator[Variant]:
+    for which in ("R", "Q"):
+        yield from (v._replace(note=which) for v in _shown(s, partial(_constant, which=which)))
+
+
 def _deviation(s: Simulator) -> Iterator[Variant]:
     return _shown(s, _root)
 
 
 def _sum(s: Simulator) -> Iterator[Variant]:
     n, d = s.system.agents, s.system.dimension
-    if n > 1:
-        yield from _shown(s, partial(_times, of=lambda c, s: float(s.system.agents)))
-        yield from _shown(s, partial(_times, of=lambda c, s: 1.0 / s.system.agents))
-    if d > 1:
-        yield from _shown(s, partial(_times, of=lambda c, s: float(s.system.dimension)))
-        yield from _shown(s, partial(_times, of=lambda c, s: 1.0 / s.system.dimension))
+    for number, name in ((n, "agents"), (d, "states")):
+        if number > 1:
+            for factor, note in ((float(number), f"the sum over {name}"), (1.0 / number, f"the mean over {name}")):
+                found = _shown(s, partial(_times, of=lambda c, s, factor=factor: factor))
+                yield from (v._replace(note=note) for v in found)
 
 
 def _one_agent(s: Simulator) -> Iterator[Variant]:
     n = s.system.agents
     if len(set(s.system.labels)) > 1 or not s.rows.uniform:
         for i in range(1, n + 1):
-            yield _certain(replace(s, whose=(i,) * n))
+            yield _certain(replace(s, whose=(i,) * n), f"agent {i}")
 
 
 def _swapped(s: Simulator) -> Iterator[Variant]:
@@ -379,7 +407,7 @@ def _swapped(s: Simulator) -> Iterator[Variant]:
     if len(set(s.system.labels)) > 1 or not s.rows.uniform:
         turned = [(*range(2, n + 1), 1), (n, *range(1, n)), tuple(range(n, 0, -1))]
         for order in dict.fromkeys(turned):
-            yield _certain(replace(s, whose=order))
+            yield _certain(replace(s, whose=order), f"{', '.join(map(str, order))} in the place of 1 to {n}")
 
 
 def _metric(s: Simulator) -> Iterator[Variant]:
@@ -387,7 +415,7 @@ def _metric(s: Simulator) -> Iterator[Variant]:
     if len(states) > 1 and s.metric is None:
         single = [f"{kind}:{state}" for state in states for kind in ("var", "std")]
         for name in ("trace", "max-eig", "det", f"rms:{','.join(states)}", *single):
-            yield _certain(replace(s, metric=metric(name, s.system.model)))
+            yield _certain(replace(s, metric=metric(name, s.system.model)), name)
 
 
 def _transposed(s: Simulator) -> Iterator[Variant]:
@@ -509,7 +537,7 @@ MISTAKES = (
     Mistake(
         "noise-for-covariance",
         "a noise covariance, R or Q, is shown for that of the estimate",
-        lambda s: _shown(s, partial(_constant, which="R"), partial(_constant, which="Q")),
+        _noise,
     ),
     Mistake("process-noise-left-out", "the process noise Q is left out", _no_noise),
     Mistake(

@@ -32,6 +32,8 @@ from stochfuse.estimators.protocol import Claims, Exchange, Late
 from stochfuse.estimators.world import claimed_only, moments
 from stochfuse.kalman.kernel import Information, at_step, corrected, gain
 from stochfuse.kalman.metrics import Metric, Moments
+from stochfuse.prediction.general import outcomes
+from stochfuse.prediction.method import Settings
 from stochfuse.scenario import capabilities
 from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.registry import MONTE_CARLO, SUMS
@@ -43,6 +45,9 @@ FUSED, PRIOR, LOCAL = "fused", "prior", "local"
 BOTH_WAYS, OWN_LOST, ALONE, AS_IT_WAS = "both ways", "own lost", "alone", "as it was"
 """Habits: a pair's messages arrive together; an agent's own estimate may be lost; the filter goes on without what was
 fused; older information is added and removed without a time update."""
+
+MOST_AGENTS = 3
+"""Agents up to which outcomes are listed."""
 
 
 class Cell(NamedTuple):
@@ -322,49 +327,42 @@ def _events(system: System, rows: LinkRows, step: int, habits: frozenset[str]) -
     return found
 
 
-class _Look:
-    """What can be seen of the estimates of a simulator, worked out once for every different estimate."""
+class _Place(NamedTuple):
+    """Where a cell's numbers come from: the fused estimates of a step, brought to a stage of the next or as they are.
 
-    def __init__(self, simulator: Simulator, histories: _Histories, errors: bool) -> None:
-        self.simulator, self.histories = simulator, histories
-        self.of = moments if errors else claimed_only
-        self.claims = histories.claims(simulator.system, simulator.told)
-        self._fused: dict[int, Moments] = {}
-        self._seen: dict[Hashable, np.ndarray] = {}
+    A step of 0 means the first estimates.
+    """
 
-    def at(self, cell: Cell, row: int) -> np.ndarray:
-        """What every run of a row shows in a cell, (runs,)."""
-        whose, agents = self.simulator.whose, [a - 1 for a in cell.agents]
-        each = [self._one(cell, row, whose[a] - 1 if whose else a) for a in agents]
-        return np.mean(each, axis=0)
+    step: int
+    stage: str
 
-    def _one(self, cell: Cell, row: int, agent: int) -> np.ndarray:
+
+class _Reading:
+    """What a simulator shows of moments."""
+
+    def __init__(self, simulator: Simulator) -> None:
+        self.simulator = simulator
+
+    def place(self, cell: Cell) -> _Place:
+        """Where the numbers of a cell come from."""
         s = self.simulator
-        if AS_IT_WAS in s.habits and cell.quantity != CLAIMED:
-            # what was not brought forward is wrong by the true state's own motion, which no footprint knows
-            return np.full(self.histories.which.shape[1], np.nan)
         plain = s.claimed_only and cell.quantity != CLAIMED
         step, stage = cell.step + (0 if plain else s.shift), FUSED if plain else s.stage
-        before = stage != FUSED
-        if step < 1 or (step == 1 and before):
-            if s.from_start:
-                start = self._number(cell, _start(s, self.of is moments))
-                return np.full(self.histories.which.shape[1], float(self._shown(start, cell)))
-            step, before, stage = 1, False, FUSED
-        kind = s.system.sensor_of[agent] if before else -1
-        key = (step, stage, kind, cell.quantity, cell.metric.name, cell.step, cell.runs)
-        if key not in self._seen:
-            seen = self._before(self._at(step - 1), step, agent, stage) if before else self._at(step)
-            self._seen[key] = self._shown(self._number(cell, seen), cell)
-        index = self.histories.steps[step - 1 - before][1]
-        return self._seen[key][index[row, :, agent]]
+        if step < 1 or (step == 1 and stage != FUSED):
+            return _Place(0 if s.from_start else 1, FUSED)
+        return _Place(step if stage == FUSED else step - 1, stage)
 
-    def _at(self, step: int) -> Moments:
-        """Moments of every different fused estimate of a step."""
-        if step not in self._fused:
-            values = self.histories.steps[step - 1][0]
-            self._fused[step] = self.of(self.claims.estimate([(1, values)], step)[0])
-        return self._fused[step]
+    def agent(self, agent: int) -> int:
+        """Whom, from 0, an agent's numbers show."""
+        return self.simulator.whose[agent] - 1 if self.simulator.whose else agent
+
+    def numbers(self, cell: Cell, place: _Place, agent: int, m: Moments) -> np.ndarray:
+        """Numbers of a cell from an agent's moments at a place."""
+        seen = m if place.stage == FUSED else self._before(m, place.step + 1, agent, place.stage)
+        numbers = self._number(cell, seen)
+        for make_of in self.simulator.shown if cell.quantity == CLAIMED else ():
+            numbers = make_of(numbers, cell, self.simulator)
+        return numbers
 
     def _before(self, m: Moments, step: int, agent: int, stage: str) -> Moments:
         """Moments before the exchange of a step, of fused estimates of the step before."""
@@ -393,10 +391,79 @@ class _Look:
             return np.trace(np.asarray(m.square)[..., states, :][..., states], axis1=-2, axis2=-1)
         return np.asarray(m.bias)[..., states[0], 0]
 
-    def _shown(self, numbers: np.ndarray, cell: Cell) -> np.ndarray:
-        for make_of in self.simulator.shown if cell.quantity == CLAIMED else ():
-            numbers = make_of(numbers, cell, self.simulator)
-        return numbers
+
+class _Look:
+    """What can be seen of the estimates of a simulator, worked out once for every different estimate."""
+
+    def __init__(self, simulator: Simulator, histories: _Histories, errors: bool) -> None:
+        self.simulator, self.histories, self.reading = simulator, histories, _Reading(simulator)
+        self.of = moments if errors else claimed_only
+        self.claims = histories.claims(simulator.system, simulator.told)
+        self._fused: dict[int, Moments] = {}
+        self._seen: dict[Hashable, np.ndarray] = {}
+
+    def at(self, cell: Cell, row: int) -> np.ndarray:
+        """What every run of a row shows in a cell, (runs,)."""
+        return np.mean([self._one(cell, row, self.reading.agent(a - 1)) for a in cell.agents], axis=0)
+
+    def _one(self, cell: Cell, row: int, agent: int) -> np.ndarray:
+        s, runs = self.simulator, self.histories.which.shape[1]
+        if AS_IT_WAS in s.habits and cell.quantity != CLAIMED:
+            # what was not brought forward is wrong by the true state's own motion, which no footprint knows
+            return np.full(runs, np.nan)
+        place = self.reading.place(cell)
+        if place.step == 0:
+            start = self.reading.numbers(cell, place, agent, _start(s, self.of is moments))
+            return np.full(runs, float(start))
+        kind = s.system.sensor_of[agent] if place.stage == LOCAL else -1
+        key = (place, kind, cell.quantity, cell.metric.name, cell.step, cell.runs, cell.agents)
+        if key not in self._seen:
+            self._seen[key] = self.reading.numbers(cell, place, agent, self._at(place.step))
+        return self._seen[key][self.histories.steps[place.step - 1][1][row, :, agent]]
+
+    def _at(self, step: int) -> Moments:
+        """Moments of every different fused estimate of a step."""
+        if step not in self._fused:
+            values = self.histories.steps[step - 1][0]
+            self._fused[step] = self.of(self.claims.estimate([(1, values)], step)[0])
+        return self._fused[step]
+
+
+def exactly(simulator: Simulator, blocks: Sequence[Block]) -> list[np.ndarray] | None:
+    """Return what a simulator shows on average, (cells,) for each block, over all outcomes; None if they are too many.
+
+    Of what is claimed, by simulators without habits.
+
+    Raises
+    ------
+    UsageError, NoAnswerError
+        If there is no such simulator.
+    """
+    s, network = simulator, simulator.system.network
+    claimed = all(cell.quantity == CLAIMED for block in blocks for cell in block.cells)
+    hard = network.agents > MOST_AGENTS or (network.agents == MOST_AGENTS and (len(network.delay) > 1 or s.rows.bursts))
+    if s.habits or s.told is not None or hard or not claimed or s.system.detects is not None:
+        return None
+    reading = _Reading(s)
+    found = outcomes(s.system, s.rows, Settings(estimator=s.estimator, criterion=s.criterion))
+    seen: dict[Hashable, np.ndarray] = {}
+
+    def one(cell: Cell, agent: int) -> np.ndarray:
+        place = reading.place(cell)
+        if place.step == 0:
+            start = reading.numbers(cell, place, agent, _start(s, False))
+            return np.full(len(s.rows.link), float(start))
+        group = next(g for g, members in enumerate(found.groups) if agent in members)
+        key = (place, group, cell.metric.name, cell.step, cell.runs, cell.agents)
+        if key not in seen:
+            of = replace(cell.metric, of=lambda P: reading.numbers(cell, place, agent, Moments(P)))
+            seen[key] = found.distribution(of, place.step, [group]).mean()
+        return seen[key]
+
+    return [
+        np.array([np.mean([one(cell, reading.agent(a - 1))[block.row] for a in cell.agents]) for cell in block.cells])
+        for block in blocks
+    ]
 
 
 def _start(s: Simulator, errors: bool) -> Moments:
