@@ -19,7 +19,7 @@ from tests.oracles.faulty_simulators import Ways, World, faulty, simulate, trace
 
 WALK = World(F=1.0, H=1.0, Q=25.0, R=100.0, P0=100.0, agents=2, steps=3)
 MOVING = World(
-    F=[[1, 1], [0, 1]], H=[[1.0, 0.0]], Q=[[0.25, 0.5], [0.5, 1.0]], R=[[30.0]], P0=[[100.0, 0], [0, 10.0]],
+    F=((1, 1), (0, 1)), H=((1.0, 0.0),), Q=((0.25, 0.5), (0.5, 1.0)), R=((30.0,),), P0=((100.0, 0), (0, 10.0)),
     agents=2, steps=3,
 )  # fmt: skip
 SHARED = World(F=0.9, H=1.0, Q=10.0, R=40.0, P0=60.0, agents=2, steps=4, shared=True)
