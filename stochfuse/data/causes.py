@@ -30,6 +30,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 from math import log, log1p
+from time import monotonic
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -49,8 +50,11 @@ if TYPE_CHECKING:
     from stochfuse.data.crosscheck import Verdict
 
 ALPHA = 0.001
-ROUGHLY, CLOSELY = 400, 4000
-"""Runs of a sample: of every mistake, and of those that may explain the results."""
+ROUGHLY, CLOSELY, FEW = (400, 400, 400, 150), 4000, 3
+"""Runs of a sample: of every mistake, by 1, 2, 3 and more agents, and of those that may explain the results; agents up
+to which links are as many as below."""
+PATIENCE = 20.0
+"""Seconds after which no other mistake is tried: of large networks the likeliest must do."""
 WORTH = 1e-9
 """p-value from which on a mistake is looked at closely."""
 NEAREST, PAIRED, LISTED = 6, 6, 8
@@ -168,14 +172,18 @@ def diagnose(
     return _Diagnosis(prediction, *_fewer(prediction, rows, blocks), alpha).causes()
 
 
+def _by_agents(numbers: Sequence[int], prediction: Prediction) -> int:
+    return numbers[min(len(prediction.group_of), len(numbers)) - 1]
+
+
 def _fewer(
     prediction: Prediction, rows: LinkRows, blocks: Sequence[Block]
 ) -> tuple[LinkRows, System, tuple[Block, ...]]:
     """As many links, steps and cells as are enough."""
-    if len(blocks) > LINKS:
-        blocks = [blocks[i] for i in np.unique(np.linspace(0, len(blocks) - 1, LINKS).astype(int))]
+    most = LINKS if len(prediction.group_of) <= FEW else LINKS // 2
+    blocks = [blocks[i] for i in np.unique(np.linspace(0, len(blocks) - 1, min(most, len(blocks))).astype(int))]
     first = min(min(cell.step for cell in block.cells) for block in blocks)
-    last = max(first, STEPS[min(len(prediction.group_of), len(STEPS)) - 1])
+    last = max(first, _by_agents(STEPS, prediction))
     last = min(last, max(cell.step for block in blocks for cell in block.cells))
     found = []
     for number, block in enumerate(blocks):
@@ -228,12 +236,13 @@ class _Diagnosis:
 
     def causes(self) -> tuple[Cause, ...]:
         """All of it."""
-        rough = _Trial(self, ROUGHLY)
+        until, runs = monotonic() + PATIENCE, _by_agents(ROUGHLY, self.prediction)
+        rough = _Trial(self, runs)
         nothing = self.judge(self.expected).distance
-        tried = self._singles(rough)
-        best = [*self._closer(tried), *self._others(rough)]
+        tried = self._singles(rough, until)
+        best = [*self._closer(tried, until), *self._others(rough)]
         if not any(self._explains(t) for t in best):
-            best += self._closer(self._pairs(rough, tried))
+            best += self._closer(self._pairs(rough, tried, until), until)
         best = [t for t in best if not self._explains(t) or t.fit.distance < nothing - BETTER]
         least = min((t.apart for t in best if self._explains(t)), default=0.0)
         ranked = sorted((t._replace(refuted=t.apart > least + SPREAD) for t in best), key=self._rank)
@@ -268,30 +277,34 @@ class _Diagnosis:
         noise = [np.diag([cell.expected_error**2 for cell in block.cells]) for block in self.blocks]
         return _Means(mean, noise, [np.zeros_like(m) for m in noise])
 
-    def _singles(self, trial: _Trial) -> list[_Tried]:
+    def _singles(self, trial: _Trial, until: float) -> list[_Tried]:
         found = []
         for number, mistake in enumerate(MISTAKES):
+            if monotonic() > until:
+                break
             listener().advance(f"trying {mistake.name}", number, len(MISTAKES))
             best = trial.best((mistake,), mistake.variants(self.base))
             found += [] if best is None else [best]
         return sorted(found, key=self._rank)
 
-    def _pairs(self, trial: _Trial, singles: Sequence[_Tried]) -> list[_Tried]:
+    def _pairs(self, trial: _Trial, singles: Sequence[_Tried], until: float) -> list[_Tried]:
         chosen = sorted(singles, key=lambda t: t.fit.off)[:PAIRED]
         pairs, found = list(combinations(chosen, 2)), []
         for number, (one, other) in enumerate(pairs):
+            if monotonic() > until:
+                break
             names = (*one.mistakes, *other.mistakes)
             listener().advance(f"trying {names[0].name} and {names[1].name}", number, len(pairs))
             best = trial.best(names, _together(one, other))
             found += [] if best is None else [best]
         return sorted(found, key=self._rank)
 
-    def _closer(self, tried: Sequence[_Tried]) -> list[_Tried]:
+    def _closer(self, tried: Sequence[_Tried], until: float) -> list[_Tried]:
         """The same, of larger samples where that may decide."""
         near = [t for t in tried if t.fit.p > WORTH][:NEAREST]
-        trial, out = _Trial(self, min(CLOSELY, 2 * max(self.runs, ROUGHLY)), exactly=True), []
+        trial, out = _Trial(self, min(CLOSELY, 2 * max(self.runs, ROUGHLY[0])), exactly=True), []
         for t in tried:
-            variants = [t.variant] if t in near and t.variant is not None else []
+            variants = [t.variant] if t in near and t.variant is not None and monotonic() < until else []
             # a search that has found something begins anew around it
             variants = [v._replace(grid=(t.at - 0.05, t.at, t.at + 0.05)) if v.grid else v for v in variants]
             again = trial.best(t.mistakes, variants) if variants else None

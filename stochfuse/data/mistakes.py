@@ -39,6 +39,8 @@ MEMORY = (0.3, 0.6, 0.9)
 """Correlation of a link's states from step to step at which a search begins."""
 FROZEN = 1e-9
 """Probability that a link which is drawn once changes in a step."""
+MOST_WEIGHED = 3
+"""Agents up to which the weights of an intersection are worked out."""
 LONG = 0.8
 """Correlation of a link's states where it is what they deliver that is estimated."""
 FILTERS, CLAIMS = "in the filters alone", "in what is claimed alone"
@@ -219,6 +221,12 @@ def _estimator(s: Simulator, name: str, unless: tuple[str, ...] = ()) -> Iterato
         yield _certain(replace(s, estimator=name, habits=s.habits - {AS_IT_WAS}))
 
 
+def _intersection(s: Simulator) -> Iterator[Variant]:
+    # weights take long, and many agents have many
+    if s.system.agents <= MOST_WEIGHED:
+        yield from _estimator(s, "covariance-intersection", ("split-ci", STAND_ALONE))
+
+
 def _habit(s: Simulator, habit: str) -> Iterator[Variant]:
     fits = {
         BOTH_WAYS: s.system.network.architecture == "ad-hoc" and s.rows.bursts is None and s.system.agents > 1,
@@ -308,14 +316,18 @@ def with_memory(rows: LinkRows, memory: float) -> LinkRows:
 
 def _bursts(s: Simulator) -> Iterator[Variant]:
     if _may_have_memory(s):
-        yield Variant(lambda memory: replace(s, rows=with_memory(s.rows, min(max(memory, 0.0), 1.0))), MEMORY)
+        yield Variant(lambda memory: replace(s, rows=with_memory(s.rows, _share(memory))), MEMORY, _share)
         # the correlation from step to step of deliveries is that of the states times the square of the contrast
         yield Variant(
-            lambda contrast: replace(s, rows=_with_contrast(s.rows, min(max(contrast, 0.0), 1.0))),
+            lambda contrast: replace(s, rows=_with_contrast(s.rows, _share(contrast))),
             MEMORY,
-            lambda contrast: LONG * contrast**2,
+            lambda contrast: LONG * _share(contrast) ** 2,
             "between better and worse",
         )
+
+
+def _share(at: float) -> float:
+    return min(max(float(at), 0.0), 1.0)
 
 
 def _with_contrast(rows: LinkRows, contrast: float) -> LinkRows:
@@ -576,7 +588,7 @@ MISTAKES = (
     Mistake(
         "intersection-for-graph",
         "covariance intersection is what was simulated",
-        lambda s: _estimator(s, "covariance-intersection", ("split-ci", STAND_ALONE)),
+        _intersection,
     ),
     Mistake("link-scaled", "the links' probabilities are {0:.3g} times those of the scenario", _scaled_links),
 )
