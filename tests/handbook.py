@@ -34,6 +34,11 @@ CHAPTERS = {
     "Models by name": "scenario.motion",
     "Sensors by name": "scenario.sensing",
     "What rounding can do": "engines.precision",
+    "What a simulator's values are distributed like": "data.expected",
+    "How a simulator's cells are judged": "data.cells",
+    "All cells together": "data.together",
+    "What is wrong with a simulator": "data.causes",
+    "What a simulator with a mistake would show": "data.supposed",
 }
 
 

@@ -27,7 +27,7 @@ from stochfuse.scenario.registry import GENERAL, METHODS, MONTE_CARLO, SIMPLIFIE
 EXAMPLES = (
     "stochfuse crosscheck results.csv",
     "stochfuse crosscheck means.json my.toml --method naive --alpha 0.01",
-    "stochfuse crosscheck runs.parquet my.toml --estimator split-ci --plot check.png",
+    "stochfuse crosscheck r.parquet my.toml --estimator split-ci --plot check.png",
     "stochfuse crosscheck runs.csv --columns covariance=P_trace,link=mu",
 )
 
@@ -37,8 +37,8 @@ def crosscheck(
         str,
         typer.Argument(
             metavar="FILE",
-            help="CSV, JSON or Parquet, - for standard input: columns run, agent, step, link, and of covariance, "
-            "squared_error, error, nees what there is; or means: agent, step, link, covariance, count, std.",
+            help="CSV, JSON or Parquet, - for standard input: columns run, agent, step, link and values; or means: "
+            "agent, step, link, values, count, std.",
         ),
     ],
     scenario: ScenarioArgument = "thesis-transient",
@@ -51,8 +51,8 @@ def crosscheck(
         str | None,
         choice(
             METHODS,
-            f"Prediction to check against: {', '.join(METHODS)} (simplified is approximate); default: general, or what "
-            "takes the estimator and the scenario.",
+            f"Prediction to check against: {', '.join(METHODS)}; default: general, or what takes estimator and "
+            "scenario.",
             WORK,
         ),
     ] = None,
@@ -71,8 +71,8 @@ def crosscheck(
 ) -> None:
     """Compare a simulator's results with the prediction; exit 0 if they agree, 1 if they do not.
 
-    Columns: covariance (claimed after fusion, as the metric says; default: trace) or covariance:METRIC, squared_error,
-    error:STATE (signed), nees. Per cell a z-score; the verdict corrects for the number of cells.
+    Values: covariance (claimed after fusion, as the metric says; default: trace) or covariance:METRIC, squared_error,
+    error:STATE (signed), nees; one or several. Per cell a z-score; the verdict corrects for the number of cells.
     """
     from stochfuse.data.crosscheck import crosscheck as check
     from stochfuse.data.results import read_results

@@ -4,5 +4,15 @@ One record of measurements and arrivals is one outcome.  `run` puts it through t
 average over chance (`stochfuse.engines.replay`), `simulate` draws such records, and `crosscheck` lays a simulator's
 results beside the prediction and says what would explain a difference.
 
+    tables, columns           a table from wherever it is, as NumPy columns; what is wrong by line and column
+    results                   what a simulator found
+    expected                  what its values are distributed like
+    cells, together           each cell judged, and all of them
+    crosscheck                the verdict
+    mistakes, supposed        mistakes that people make, and what a simulator with one would show
+    blocks, causes            which of them explains a verdict that disagrees
+
+A new mistake is one entry in `mistakes.MISTAKES`.
+
 The room knows files and the rooms below; it knows no table and no screen.
 """

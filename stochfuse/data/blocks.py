@@ -23,7 +23,7 @@ COMPLETE = 0.5
 """Share of runs with a value in every cell from which on the runs are taken."""
 
 
-def blocks_of(verdict: Verdict) -> tuple[Block, ...]:
+def blocks_behind(verdict: Verdict) -> tuple[Block, ...]:
     """Return the cells of every link probability, of the first steps, with what each run has."""
     if not verdict.cells:
         return ()

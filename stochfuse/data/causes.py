@@ -35,7 +35,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from stochfuse.data.blocks import blocks_of
+from stochfuse.data.blocks import blocks_behind
 from stochfuse.data.mistakes import DEPENDENT, MISTAKES, WRONG_LINK, Mistake, Variant
 from stochfuse.data.supposed import CLAIMED, ERROR, SQUARED, Block, Cell, Sampler, Simulator, exactly
 from stochfuse.engines.distribution import Distribution
@@ -198,13 +198,16 @@ def _fewer(
 
 
 def causes_of(verdict: Verdict, rows: LinkRows) -> tuple[Cause, ...]:
-    """Say what would explain a verdict that disagrees; empty where it agrees.
+    """Say what would explain a verdict that disagrees; empty where it agrees, or does not for its evidence alone.
 
     Parameters
     ----------
     rows : links that its prediction was asked for.
     """
-    return () if verdict.agrees else diagnose(verdict.prediction, rows, blocks_of(verdict), alpha=verdict.alpha)
+    level = verdict.alpha if verdict.p_together is None else verdict.alpha / 2
+    if verdict.p_largest > level and (verdict.p_together is None or verdict.p_together > level):
+        return ()
+    return diagnose(verdict.prediction, rows, blocks_behind(verdict), alpha=verdict.alpha)
 
 
 def summary(causes: Sequence[Cause]) -> str:
@@ -245,7 +248,8 @@ class _Diagnosis:
             best += self._closer(self._pairs(rough, tried, until), until)
         best = [t for t in best if not self._explains(t) or t.fit.distance < nothing - BETTER]
         least = min((t.apart for t in best if self._explains(t)), default=0.0)
-        ranked = sorted((t._replace(refuted=t.apart > least + SPREAD) for t in best), key=self._rank)
+        best = [t._replace(refuted=self._explains(t) and t.apart > least + SPREAD) for t in best]
+        ranked = sorted(best, key=self._rank)
         explaining = sum(map(self._explains, ranked))
         return tuple(map(self._cause, ranked[: max(LISTED, explaining)]))
 

@@ -217,7 +217,8 @@ class Expectations:
         p = self.prediction
         if p.outcomes is not None:
             probability, moments = p.outcomes.listed(step, group)
-            return [_of_outcomes(probability, family.parts(moments)) for family in self.families]
+            parts = [family.parts(moments) for family in self.families]
+            return [_of_outcomes(probability, each, len(p.link)) for each in parts]
         if p.sampled is not None:
             return [_of_sample(p.sampled, parts, step, group) for parts in self._drawn]
         moments = p.moments.map(lambda M: M[:, step - 1, group])
@@ -251,16 +252,16 @@ def knows(prediction: Prediction, family: Family) -> bool:
     return family.linear
 
 
-def _of_outcomes(probability: np.ndarray, parts: Parts) -> Expected:
+def _of_outcomes(probability: Callable[[int], np.ndarray], parts: Parts, rows: int) -> Expected:
     means, variances, thirds = parts.cumulants
-    mean = probability @ means
-    variance, third = np.empty_like(mean), np.empty_like(mean)
-    for row, p in enumerate(probability):
+    mean, variance, third = np.empty(rows), np.empty(rows), np.empty(rows)
+    for row in range(rows):
+        p = probability(row)
+        mean[row] = p @ means
         variance[row], third[row] = _central(p, means - mean[row], variances, thirds)
     deviation = _deviation(mean, variance)
-    return Expected(
-        mean, deviation, _skewness(deviation**2, third), lambda row: Law(probability[row], parts), exact=True
-    )
+    skewness = _skewness(deviation**2, third)
+    return Expected(mean, deviation, skewness, lambda row: Law(probability(row), parts), exact=True)
 
 
 def _of_sample(sampled: Sampled, parts: Parts, step: int, group: int) -> Expected:

@@ -205,8 +205,8 @@ def _without_values(table: Columns, named: Sequence[str]) -> list[str]:
     if not empty.any():
         return []
     number, first = int(empty.sum()), table.line(int(empty.argmax()))
-    rows, where = ("row holds", "at") if number == 1 else ("rows hold", "first at")
-    return [f"{number} of {table.length} {rows} no {' and no '.join(named)}, {where} {table.what} {first}"]
+    hold, where = ("holds", "at") if number == 1 else ("hold", "first at")
+    return [f"{number} of {table.length} rows {hold} no {' and no '.join(named)}, {where} {table.what} {first}"]
 
 
 def _run(table: Columns) -> np.ndarray | None:

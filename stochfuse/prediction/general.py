@@ -372,19 +372,20 @@ class Outcomes:
         merged = Distribution.merged(np.concatenate(values), np.concatenate(weights, axis=1))
         return Distribution(merged.values, merged.probability / merged.probability.sum(axis=1, keepdims=True))
 
-    def listed(self, step: int, group: int) -> tuple[np.ndarray, Moments]:
-        """Probability of every outcome of a step, (rows, claims), and the moments of an agent's error in it."""
-        probability, found = [], []
+    def listed(self, step: int, group: int) -> tuple[Callable[[int], np.ndarray], Moments]:
+        """What gives the probability of every outcome of a step in a row, and an agent's moments in each."""
+        weights, found = [], []
         for by_group, estimate, _ in self.found.shared_out(step, self.values):
             some = np.flatnonzero(by_group[group].any(axis=0))
             found.append((moments if self.errors else claimed_only)(estimate).map(lambda M: M[some]))  # noqa: B023
-            probability.append(self._probability(by_group[group][:, some], slice(None)))
-        weights = np.concatenate(probability, axis=1)
+            weights.append(by_group[group][:, some])
+
+        def probability(row: int) -> np.ndarray:
+            p = np.concatenate([self._probability(weight, slice(row, row + 1))[0] for weight in weights])
+            return p / p.sum()
+
         columns = zip(*found, strict=True)
-        return (
-            weights / weights.sum(axis=1, keepdims=True),
-            Moments(*(None if some[0] is None else np.concatenate(some) for some in columns)),
-        )
+        return probability, Moments(*(None if some[0] is None else np.concatenate(some) for some in columns))
 
     def _probability(self, weight: np.ndarray, rows: slice) -> np.ndarray:
         """Probabilities (rows, claims) from weights on the weights' axis."""

@@ -117,15 +117,19 @@ def crosscheck_report(shown: CrosscheckView) -> Report:
 def crosscheck_table(shown: CrosscheckView) -> Table:
     """Return one row per cell, with quantity and metric where there are several."""
     digits, several = shown.digits, len(shown.senses) > 1
+    runs = {cell.runs for cell in shown.verdict.cells}
+    # what all have in common is said once where quantities need the room
+    alike = several and len(runs) == 1
+    said = (f"{counted(min(runs), 'run')} in every cell",) if alike else ()
     rows = []
     for cell in shown.verdict.cells:
         rows.append(
             (
-                *((_sense(cell),) if several else ()),
+                *((_sense(cell, shown.senses),) if several else ()),
                 cell.link,
                 str(cell.step),
                 _agents(cell),
-                str(cell.runs),
+                *(() if alike else (str(cell.runs),)),
                 number(cell.mean, digits),
                 f"{cell.error:.2g}",
                 number(cell.expected, digits) + (f" ±{cell.expected_error:.2g}" if cell.expected_error else ""),
@@ -134,15 +138,17 @@ def crosscheck_table(shown: CrosscheckView) -> Table:
             )
         )
     return Table(
-        shown.titles,
+        (*shown.titles, *said),
         (*(("of",) if several else ()), "µ", "k", "agents"),
-        ("runs", "mean", "±", "expected", "z", "p corr."),
+        (*(() if alike else ("runs",)), "mean", "±", "expected", "z", "p corr."),
         tuple(rows),
     )
 
 
-def _sense(cell: Cell) -> str:
-    return cell.quantity if cell.quantity == "nees" else f"{cell.quantity} {cell.metric}"
+def _sense(cell: Cell, senses: Sequence[tuple[str, str]]) -> str:
+    """Quantity of a cell, with its metric where there are several of it."""
+    alone = [quantity for quantity, _ in senses].count(cell.quantity) == 1
+    return cell.quantity if alone else f"{cell.quantity} {cell.metric}"
 
 
 def crosscheck_csv(shown: CrosscheckView) -> str:

@@ -15,6 +15,8 @@ from stochfuse.data.results import read_results
 from stochfuse.data.supposed import Block, Cell
 from stochfuse.kalman.metrics import metric
 from stochfuse.scenario.scenario import link_rows
+from tests.cli.command import run as command
+from tests.cli.command import strict_json
 from tests.oracles.faulty_simulators import Ways, World, faulty, simulate, trace
 
 WALK = World(F=1.0, H=1.0, Q=25.0, R=100.0, P0=100.0, agents=2, steps=3)
@@ -29,7 +31,7 @@ PLANTED = (
     "own-message-lost", "delay-of-one", "one-minus-link", "squared-link", "wrong-link", "deviation-for-variance",
     "three-sigma", "sum-for-mean", "noise-for-covariance", "Q-scaled", "R-scaled", "P-scaled",
     "process-noise-left-out", "local-for-fused", "not-fed-back", "links-drawn-once", "bursts",
-    "silent-at-step-1", "pair-drawn-once", "shared-start", "independent-start", "F-transposed", "dependent-runs",
+    "silent-at-step-1", "pair-drawn-once", "shared-start", "independent-start", "F-transposed", "wrong-architecture", "dependent-runs",
 )  # fmt: skip
 
 
@@ -159,6 +161,37 @@ def test_the_door_takes_cells_of_ones_own():
     first = diagnose(prediction, rows, [Block("0.5", 0, cells)])[0]
     assert first.cause == "sum-for-mean"
     assert "(the sum over agents)" in first.text
+
+
+def test_the_command_line_names_causes(tmp_path):
+    """Expected at µ = 0.75 and sent as those of µ = 0.25."""
+    rows = [(1, 43.9), (2, 24.6), (3, 22.0)]
+    file = tmp_path / "means.csv"
+    file.write_text("link,step,covariance,count\n" + "".join(f"0.25,{k},{P},900\n" for k, P in rows))
+    done = command("crosscheck", file, code=1, env={"COLUMNS": "200"})
+    assert "likely cause: one-minus-link explains the numbers" in done.stdout
+    assert "one-minus-link: µ is the probability of a loss; explains all but p = " in done.stdout
+    assert "the results disagree with the prediction" in done.stderr
+    causes = strict_json(command("crosscheck", file, "--format", "json", code=1).stdout)["causes"]
+    assert causes[0]["cause"] == "one-minus-link"
+    assert causes[0]["explains"] is True
+    assert 0.001 < causes[0]["p"] <= 1
+    assert [c["explains"] for c in causes] == sorted((c["explains"] for c in causes), reverse=True)
+
+
+def test_unlike_agents_may_be_swapped():
+    world = World(F=1.0, H=1.0, Q=25.0, R=100.0, P0=100.0, agents=2, steps=3, sensors=(None, 25.0))
+    verdict = found(world, "agents-swapped", links=(0.4,))
+    assert verdict.causes[0].cause == "agents-swapped"
+    assert "(2, 1 in the place of 1 to 2)" in verdict.causes[0].text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", ["own-message-lost", "one-minus-link", "delay-of-one", "not-fed-back"])
+def test_planted_mistakes_of_naive_fusion(fault):
+    world = World(F=1.0, H=1.0, Q=25.0, R=100.0, P0=100.0, agents=3, steps=3, naive=True)
+    first = found(world, fault, links=(0.4,), runs=1500, estimator="naive").causes[0]
+    assert (first.cause, first.explains) == (fault, True)
 
 
 @pytest.mark.slow

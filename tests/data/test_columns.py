@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stochfuse.data import columns
+from stochfuse.data import columns, tables
 from stochfuse.data.columns import LABEL, NUMBER, TEXT, WHOLE, ColumnsError, Field, read_chunks, read_columns
 from stochfuse.errors import StochfuseError
 
@@ -31,7 +31,7 @@ FIELDS = (
 def parser(request, monkeypatch):
     """With pyarrow, and as if it were not installed."""
     if request.param == "csv":
-        monkeypatch.setattr(columns, "_arrow", lambda module: None)
+        monkeypatch.setattr(tables, "_arrow", lambda module: None)
     return request.param
 
 
@@ -145,7 +145,7 @@ def test_chunks_are_the_whole_in_parts(tmp_path, parser, monkeypatch):
     path = written(tmp_path, "\n".join(lines))
     whole = read_columns(path, FIELDS)
     for block in (1, 37, 1000):
-        monkeypatch.setattr(columns, "BLOCK", block)
+        monkeypatch.setattr(tables, "BLOCK", block)
         parts = list(read_chunks(path, FIELDS, rows=20))
         assert max(part.length for part in parts) <= 20
         assert [part.line(i) for part in parts for i in range(part.length)] == numbers
@@ -160,7 +160,7 @@ def test_chunks_are_the_whole_in_parts(tmp_path, parser, monkeypatch):
 
 
 def test_memory_does_not_grow_with_the_file(tmp_path, parser, monkeypatch):
-    monkeypatch.setattr(columns, "BLOCK", 50_000)
+    monkeypatch.setattr(tables, "BLOCK", 50_000)
     peaks = []
     for rows in (10_000, 100_000):
         path = written(tmp_path, "step,z1\n" + "1,0.25\n" * rows)
