@@ -38,6 +38,7 @@ CHAPTERS = {
     "How a simulator's cells are judged": "data.cells",
     "All cells together": "data.together",
     "What is wrong with a simulator": "data.causes",
+    "How well numbers explain it": "data.fits",
     "What a simulator with a mistake would show": "data.supposed",
 }
 

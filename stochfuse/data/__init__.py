@@ -10,7 +10,7 @@ results beside the prediction and says what would explain a difference.
     cells, together           each cell judged, and all of them
     crosscheck                the verdict
     mistakes, supposed        mistakes that people make, and what a simulator with one would show
-    blocks, causes            which of them explains a verdict that disagrees
+    blocks, fits, causes      which of them explains a verdict that disagrees
 
 A new mistake is one entry in `mistakes.MISTAKES`.
 

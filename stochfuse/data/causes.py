@@ -1,15 +1,12 @@
 """What is wrong with a simulator: known mistakes, each tried for how well it explains the results.
 
-A mistake makes another simulator (`stochfuse.data.mistakes`), and that shows other numbers m (`supposed`).  With the
-results' means x̄ and the covariance C of these, from the runs themselves, over the steps of a link
+A mistake makes another simulator (`stochfuse.data.mistakes`), and that shows other numbers (`supposed`),
 
-    T² = (x̄ − m)ᵀ (C + C_m)⁻¹ (x̄ − m)        Hotelling's, with the freedom of its cells, less one for a number estimated
+    m = expected + mean of (what the mistaken simulator shows − what the right one shows)
 
-where C_m is how far the sample behind m is known: m = expected + mean of (what the mistaken simulator shows − what the
-right one shows), over the same histories where that is closer than what it shows by itself.  Links are independent; the
-T² of each becomes a χ² of equal probability, and these add up.  Cells that do not vary have to be met to their digits.
-A mistake explains the results if p is above the crosscheck's level, and no other one that does so spreads the runs far
-more as they are.
+over the same histories, where that is known better than what it shows by itself; over all outcomes, where these can be
+listed.  It explains the results if the p of their T² (`fits`) is above the crosscheck's level, with the freedom of the
+cells, less one for a number estimated, and no other one that does so spreads the runs far more as they are.
 
 The likeliest comes first: of those that explain, by T² plus the logarithm of the number of runs for every number that
 was estimated (Schwarz), plus how unlike the runs of each cell are spread (4 λ² of Kolmogorov and Smirnov's λ of two
@@ -27,15 +24,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import combinations
-from math import log, log1p
+from math import log
 from time import monotonic
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from stochfuse.data.blocks import blocks_behind
+from stochfuse.data.fits import ROUNDING, Fit, Means, Results, covariance_of
 from stochfuse.data.mistakes import DEPENDENT, MISTAKES, WRONG_LINK, Mistake, Variant
 from stochfuse.data.supposed import CLAIMED, ERROR, SQUARED, Block, Cell, Sampler, Simulator, exactly
 from stochfuse.engines.distribution import Distribution
@@ -61,15 +58,11 @@ NEAREST, PAIRED, LISTED = 6, 6, 8
 """Mistakes that are looked at closely, those tried in pairs, and causes named that do not explain."""
 LINKS, CELLS, STEPS = 4, 60, (8, 8, 4, 3)
 """Links, cells of a link, and first steps, of 1, 2, 3 and more agents, that are looked at."""
-BETTER, MOST_APART, SPREAD = 6.0, 100.0, 40.0
-"""Least gain in T² over a right simulator; most that the spread of one cell counts, and most by which that of all may
-be worse than another mistake's."""
-CLOSE, FIRM = 0.01, 1e-6
-"""Gain in T² that ends a search; share of a direction's variance below which it is rounding."""
+BETTER, SPREAD, CLOSE = 6.0, 40.0, 0.01
+"""Least gain in T² over a right simulator, most by which the spread of the runs may be worse than another mistake's,
+and gain in T² that ends a search."""
 DIFFERENT = 0.95
 """Share of runs with noise of their own below which runs are repeated."""
-ROUNDING = 1e-6
-"""Relative difference of cells that do not vary which is rounding."""
 APPROXIMATE = "approximate-prediction"
 
 
@@ -96,29 +89,6 @@ class Cause(NamedTuple):
     of: tuple[str, ...]
 
 
-class _Fit(NamedTuple):
-    """How well some numbers explain the results: T², freedom, p, how far cells are off, the largest |z|, and of how
-    many cells nothing is said.
-    """
-
-    distance: float
-    freedom: int
-    p: float
-    off: float
-    largest: float
-    where: str
-    untold: int
-
-
-class _Means(NamedTuple):
-    """What a simulator shows, per block: means, covariance of these, and covariance of a run."""
-
-    mean: list[np.ndarray]
-    noise: list[np.ndarray]
-    spread: list[np.ndarray]
-    shown: list[np.ndarray] | None = None
-
-
 class _Tried(NamedTuple):
     """A mistake, the way to make it that comes closest, and how close.
 
@@ -133,7 +103,7 @@ class _Tried(NamedTuple):
 
     mistakes: tuple[Mistake, ...]
     variant: Variant | None
-    fit: _Fit
+    fit: Fit
     at: float = 0.0
     numbers: int = 0
     apart: float = 0.0
@@ -176,9 +146,7 @@ def _by_agents(numbers: Sequence[int], prediction: Prediction) -> int:
     return numbers[min(len(prediction.group_of), len(numbers)) - 1]
 
 
-def _fewer(
-    prediction: Prediction, rows: LinkRows, blocks: Sequence[Block]
-) -> tuple[LinkRows, System, tuple[Block, ...]]:
+def _fewer(prediction: Prediction, rows: LinkRows, blocks: Sequence[Block]) -> tuple[LinkRows, System, Results]:
     """As many links, steps and cells as are enough."""
     most = LINKS if len(prediction.group_of) <= FEW else LINKS // 2
     blocks = [blocks[i] for i in np.unique(np.linspace(0, len(blocks) - 1, min(most, len(blocks))).astype(int))]
@@ -194,7 +162,7 @@ def _fewer(
     chosen = rows.take(np.array([block.row for block in blocks]))
     if chosen.varies:
         chosen = replace(chosen, link=chosen.link[:, :last])
-    return chosen, prediction.scenario.until(last).system, tuple(block for block in found if block.cells)
+    return chosen, prediction.scenario.until(last).system, Results(tuple(block for block in found if block.cells))
 
 
 def causes_of(verdict: Verdict, rows: LinkRows) -> tuple[Cause, ...]:
@@ -234,14 +202,14 @@ class _Diagnosis:
     prediction: Prediction
     rows: LinkRows
     system: System
-    blocks: tuple[Block, ...]
+    results: Results
     alpha: float
 
     def causes(self) -> tuple[Cause, ...]:
         """All of it."""
         until, runs = monotonic() + PATIENCE, _by_agents(ROUGHLY, self.prediction)
         rough = _Trial(self, runs)
-        nothing = self.judge(self.expected).distance
+        nothing = self.results.judge(self.results.expected).distance
         tried = self._singles(rough, until)
         best = [*self._closer(tried, until), *self._others(rough)]
         if not any(self._explains(t) for t in best):
@@ -262,24 +230,7 @@ class _Diagnosis:
         """The right simulator."""
         p = self.prediction
         estimator = LFG if p.estimator == BROADCAST_PRIOR else p.estimator
-        return Simulator(self.system, self.rows, estimator, followed=self.errors)
-
-    @property
-    def errors(self) -> bool:
-        """Whether some cell is of the true error."""
-        return any(cell.quantity != CLAIMED for block in self.blocks for cell in block.cells)
-
-    @property
-    def runs(self) -> int:
-        """Runs of the largest cell."""
-        return max(cell.runs for block in self.blocks for cell in block.cells)
-
-    @property
-    def expected(self) -> _Means:
-        """What the prediction expects."""
-        mean = [np.array([cell.expected for cell in block.cells]) for block in self.blocks]
-        noise = [np.diag([cell.expected_error**2 for cell in block.cells]) for block in self.blocks]
-        return _Means(mean, noise, [np.zeros_like(m) for m in noise])
+        return Simulator(self.system, self.rows, estimator, followed=self.results.errors)
 
     def _singles(self, trial: _Trial, until: float) -> list[_Tried]:
         found = []
@@ -306,7 +257,7 @@ class _Diagnosis:
     def _closer(self, tried: Sequence[_Tried], until: float) -> list[_Tried]:
         """The same, of larger samples where that may decide."""
         near = [t for t in tried if t.fit.p > WORTH][:NEAREST]
-        trial, out = _Trial(self, min(CLOSELY, 2 * max(self.runs, ROUGHLY[0])), exactly=True), []
+        trial, out = _Trial(self, min(CLOSELY, 2 * max(self.results.runs, ROUGHLY[0])), exactly=True), []
         for t in tried:
             variants = [t.variant] if t in near and t.variant is not None and monotonic() < until else []
             # a search that has found something begins anew around it
@@ -319,7 +270,7 @@ class _Diagnosis:
         return t.fit.p > self.alpha and not t.refuted
 
     def _rank(self, t: _Tried) -> tuple[float, ...]:
-        price = log(max(2, self.runs)) * (t.numbers + len(t.mistakes) - 1)
+        price = log(max(2, self.results.runs)) * (t.numbers + len(t.mistakes) - 1)
         if self._explains(t):
             return (0.0, round(t.fit.distance + t.apart + price, 6))
         return (1.0, t.fit.off + price / max(1, t.fit.freedom))
@@ -348,100 +299,9 @@ class _Diagnosis:
             of=names,
         )
 
-    def judge(self, means: _Means, estimated: int = 0, runs: Sequence[float] | None = None) -> _Fit:
-        """How well some means explain the results.
-
-        Parameters
-        ----------
-        runs : per block, number of runs that are as good as independent; default: all.
-        """
-        distance, freedom, exact, off, largest, where, untold = 0.0, 0, 0, 0.0, -1.0, "", 0
-        for b, block in enumerate(self.blocks):
-            r, C = np.array([cell.mean for cell in block.cells]) - means.mean[b], means.noise[b]
-            known, floor = np.flatnonzero(~np.isnan(r)), self._floor(b)
-            # cells of which a mistake says nothing are as far off as they were
-            wrong = [cell for cell, unknown in zip(block.cells, np.isnan(r), strict=True) if unknown]
-            untold += len(wrong)
-            off += sum(log1p(((c.mean - c.expected) / c.error) ** 2) for c in wrong if c.error > 0)
-            if not len(known):
-                continue
-            C = (self._covariance(b, means.spread[b], runs) + C)[np.ix_(known, known)]
-            r, floor = r[known], floor[known]
-            deviation = np.sqrt(np.maximum(np.diagonal(C), 0.0))
-            fixed = deviation <= floor
-            beyond = np.maximum(0.0, np.abs(r) - floor)
-            z = beyond / np.where(fixed, floor, np.where(deviation > 0, deviation, 1.0))
-            off += float(np.log1p(z**2).sum())
-            if z.max() > largest:
-                largest, cell = float(z.max()), block.cells[int(known[z.argmax()])]
-                where = f"k = {cell.step}" if not block.link else f"µ = {block.link}, k = {cell.step}"
-            loose = np.flatnonzero(~fixed)
-            exact += int(fixed.sum())
-            T, d = _hotelling(np.copysign(beyond, r)[loose], C[np.ix_(loose, loose)], self._sample(b, runs))
-            distance, freedom = distance + T + float((z[fixed] ** 2).sum()), freedom + d
-        from scipy.special import chdtrc
-
-        left = max(freedom - (0 if exact else estimated), 1)
-        return _Fit(distance, left, float(chdtrc(left, distance)), off, largest, where, untold)
-
-    def scales(self, means: _Means) -> list[np.ndarray]:
-        """Matrix W of every block, such that |W r|² is about the T² of a difference r from means like these."""
-        found = []
-        for b in range(len(self.blocks)):
-            C, floor = self._covariance(b, means.spread[b], None) + means.noise[b], self._floor(b)
-            deviation = np.maximum(np.sqrt(np.maximum(np.diagonal(C), 0.0)), floor)
-            correlation = C / np.outer(deviation, deviation)
-            np.fill_diagonal(correlation, 1.0)
-            values, vectors = np.linalg.eigh(np.nan_to_num(correlation))
-            firm = values > FIRM
-            found.append((vectors[:, firm] / np.sqrt(values[firm])).T / deviation)
-        return found
-
-    def _sample(self, b: int, runs: Sequence[float] | None) -> float:
-        return float(runs[b]) if runs is not None else float(min(cell.runs for cell in self.blocks[b].cells))
-
-    def _floor(self, b: int) -> np.ndarray:
-        means = np.array([cell.mean for cell in self.blocks[b].cells])
-        given = np.array([cell.resolution for cell in self.blocks[b].cells])
-        return given + ROUNDING * np.maximum(np.abs(means), 1e-300)
-
-    def _covariance(self, b: int, spread: np.ndarray, runs: Sequence[float] | None) -> np.ndarray:
-        """Covariance of a block's means: the runs' own, where they vary; else that of the simulator supposed."""
-        block = self.blocks[b]
-        count = np.array([float(cell.runs) for cell in block.cells])
-        each = count if runs is None else np.full(len(count), float(runs[b]))
-        supposed = spread / np.sqrt(np.outer(each, each))
-        if block.values is None:
-            errors = np.array(
-                [cell.error if cell.quantity != CLAIMED or not spread.any() else 0.0 for cell in block.cells]
-            )
-            return supposed + np.diag(np.maximum(0.0, errors**2 - np.diagonal(supposed) * (errors > 0)))
-        C = self._of_runs[b] / np.sqrt(np.outer(each, each))
-        still = np.diagonal(C) <= self._floor(b) ** 2
-        C[still] = C[:, still] = 0.0
-        C[np.ix_(still, still)] = np.where(
-            np.outer(still, still)[np.ix_(still, still)], supposed[np.ix_(still, still)], 0
-        )
-        return C
-
-    def apart(self, means: _Means) -> float:
-        """How unlike the runs are spread over the cells of claimed numbers, as a χ²; 0 where only means are given."""
-        total = 0.0
-        for b, block in enumerate(self.blocks):
-            for i, cell in enumerate(block.cells):
-                if block.values is not None and means.shown is not None and cell.quantity == CLAIMED:
-                    slack = 4.0 * cell.error + self._floor(b)[i]
-                    total += min(MOST_APART, _unlike(block.values[:, i], means.shown[b][:, i], slack))
-        return total
-
-    @cached_property
-    def _of_runs(self) -> list[np.ndarray]:
-        """Covariance of a run's values, per block."""
-        return [np.zeros(0) if x.values is None else np.atleast_2d(np.cov(x.values, rowvar=False)) for x in self.blocks]
-
     def _wrong_link(self, trial: _Trial) -> _Tried | None:
         """µ of every row as it would fit best."""
-        curve = _curve(self.prediction, self.rows, self.blocks)
+        curve = _curve(self.prediction, self.rows, self.results.blocks)
         if curve is None:
             return None
         listener().advance(f"trying {WRONG_LINK}", len(MISTAKES), len(MISTAKES))
@@ -449,7 +309,7 @@ class _Diagnosis:
         at = curve(grid)
         nothing = [np.zeros((m.shape[1], m.shape[1])) for m in at]
         found = []
-        for b in range(len(self.blocks)):
+        for b in range(len(self.results.blocks)):
             µ = grid
             mean = at[b]
             for _ in range(4):
@@ -460,20 +320,20 @@ class _Diagnosis:
                 mean = curve(µ)[b]
             scores = [self._alone(b, row, nothing[b]) for row in mean]
             found.append((float(µ[int(np.argmin(scores))]), mean[int(np.argmin(scores))]))
-        fit = self.judge(_Means([m for _, m in found], nothing, nothing), len(self.blocks))
+        fit = self.results.judge(Means([m for _, m in found], nothing, nothing), len(self.results.blocks))
         shown = ", ".join(f"{µ:.4g}" for µ, _ in found)
-        whose = ", ".join(block.link or "given" for block in self.blocks)
+        whose = ", ".join(block.link or "given" for block in self.results.blocks)
         mistake = Mistake(
             WRONG_LINK, f"the links' probabilities are {{0}} where they should be {whose}", lambda _: iter(())
         )
         rows = uniform_rows([µ for µ, _ in found])
         means = trial.means(replace(self.base, rows=rows))
-        apart = 0.0 if means is None else self.apart(means)
+        apart = 0.0 if means is None else self.results.apart(means)
         return _Tried((mistake,), None, fit, found[0][0], len(found), apart, False, shown)
 
     def _alone(self, b: int, mean: np.ndarray, nothing: np.ndarray) -> float:
-        alone = replace(self, blocks=self.blocks[b : b + 1])
-        return alone.judge(_Means([mean], [nothing], [nothing])).distance
+        alone = Results(self.results.blocks[b : b + 1])
+        return alone.judge(Means([mean], [nothing], [nothing])).distance
 
     def _dependent(self, trial: _Trial) -> _Tried | None:
         """The right results, of fewer runs than there seem to be."""
@@ -481,7 +341,7 @@ class _Diagnosis:
         if means is None:
             return None
         effective, dependent = [], False
-        for block, spread in zip(self.blocks, means.spread, strict=True):
+        for block, spread in zip(self.results.blocks, means.spread, strict=True):
             n = float(min(cell.runs for cell in block.cells))
             found = None if block.values is None else independent_runs(block.values, vary=bool(spread.any()))
             noisy = [i for i, cell in enumerate(block.cells) if cell.quantity != CLAIMED]
@@ -494,7 +354,9 @@ class _Diagnosis:
             effective.append(n if found is None else found)
         if not dependent:
             return None
-        fit = self.judge(means._replace(mean=self.expected.mean, noise=self.expected.noise), runs=effective)
+        fit = self.results.judge(
+            means._replace(mean=self.results.expected.mean, noise=self.results.expected.noise), runs=effective
+        )
         text = "the runs are not independent of each other, and tell no more than about {0} that are"
         shown = f"{min(effective):.3g}"
         return _Tried((Mistake(DEPENDENT, text, lambda _: iter(())),), None, fit, min(effective), 1, 0.0, False, shown)
@@ -511,28 +373,28 @@ class _Trial:
 
     def __init__(self, diagnosis: _Diagnosis, runs: int, *, exactly: bool = False) -> None:
         self.diagnosis, self.exactly = diagnosis, exactly
-        self.sampler = Sampler(runs, errors=diagnosis.errors)
+        self.sampler = Sampler(runs, errors=diagnosis.results.errors)
         self._right: list[np.ndarray] | None = None
 
-    def means(self, simulator: Simulator) -> _Means | None:
+    def means(self, simulator: Simulator) -> Means | None:
         """What a simulator shows; None if there is no such simulator."""
         d = self.diagnosis
         try:
             with np.errstate(all="ignore"):
                 if self._right is None:
-                    self._right = self.sampler.shown(d.base, d.blocks)
-                shown = self.sampler.shown(simulator, d.blocks)
+                    self._right = self.sampler.shown(d.base, d.results.blocks)
+                shown = self.sampler.shown(simulator, d.results.blocks)
         except (StochfuseError, np.linalg.LinAlgError):
             return None
         mean, noise, spread = [], [], []
         outright = self.exact(simulator)
         difference = d.prediction.nature == "exact"
-        for b, (X, Z, expected) in enumerate(zip(shown, self._right, d.expected.mean, strict=True)):
+        for b, (X, Z, expected) in enumerate(zip(shown, self._right, d.results.expected.mean, strict=True)):
             unknown = np.isnan(X).all(axis=0)
             if not np.isfinite(X[:, ~unknown]).all():
                 return None
             X = np.where(unknown, Z, X)
-            own, apart = _covariance_of(X), _covariance_of(X - Z)
+            own, apart = covariance_of(X), covariance_of(X - Z)
             # cells of unlike sizes count alike
             scale = np.where(np.diagonal(own) > 0, np.diagonal(own), 1.0)
             closer = difference and (np.diagonal(apart) / scale).sum() <= (np.diagonal(own) / scale).sum()
@@ -540,7 +402,7 @@ class _Trial:
             mean.append(np.where(unknown, np.nan, of_sample) if outright is None else outright[b])
             noise.append(np.zeros_like(own) if outright is not None else (apart if closer else own) / len(X))
             spread.append(own)
-        return _Means(mean, noise, spread, shown)
+        return Means(mean, noise, spread, shown)
 
     def exact(self, simulator: Simulator) -> list[np.ndarray] | None:
         """What a simulator shows on average, where that is asked for and can be had."""
@@ -548,7 +410,7 @@ class _Trial:
             return None
         try:
             with np.errstate(all="ignore"):
-                found = exactly(simulator, self.diagnosis.blocks)
+                found = exactly(simulator, self.diagnosis.results.blocks)
         except (StochfuseError, np.linalg.LinAlgError):
             return None
         return found if found is None or all(np.isfinite(m).all() for m in found) else None
@@ -562,14 +424,14 @@ class _Trial:
         if not variant.grid:
             means = self.means(variant.of(0.0))
             return None if means is None else self._tried(mistakes, variant, means)
-        points: dict[float, _Means] = {}
+        points: dict[float, Means] = {}
         for at in variant.grid:
             means = self.means(variant.of(at))
             if means is not None:
                 points[at] = means
         if len(points) < 3:
             return None
-        distance = {at: self.diagnosis.judge(means, 1).distance for at, means in points.items()}
+        distance = {at: self.diagnosis.results.judge(means, 1).distance for at, means in points.items()}
         for _ in range(8):
             best = min(distance, key=distance.__getitem__)
             new = self._lowest(points, best)
@@ -578,24 +440,24 @@ class _Trial:
             means = self.means(variant.of(new))
             if means is None:
                 break
-            points[new], distance[new] = means, self.diagnosis.judge(means, 1).distance
+            points[new], distance[new] = means, self.diagnosis.results.judge(means, 1).distance
             if 0 <= distance[best] - distance[new] < CLOSE:
                 break
         best = min(distance, key=distance.__getitem__)
         return self._tried(mistakes, variant, points[best], best)
 
-    def _lowest(self, points: dict[float, _Means], best: float) -> float:
+    def _lowest(self, points: dict[float, Means], best: float) -> float:
         """Where the cells' parabolas through three points come closest to the results, near the best of these."""
         a, b, c = sorted(sorted(points, key=lambda at: abs(at - best))[:3])
         low, high = a - (b - a) / 2 - b, c + (c - b) / 2 - b
         quartic = np.zeros(5)
-        for block, W in enumerate(self.diagnosis.scales(points[best])):
+        for block, W in enumerate(self.diagnosis.results.scales(points[best])):
             at_a, at_b, at_c = (points[at].mean[block] for at in (a, b, c))
             # Newton's form about b: m = m_b + s u + q u²
             left, right = (at_b - at_a) / (b - a), (at_c - at_b) / (c - b)
             q = (right - left) / (c - a)
             s = left + q * (b - a)
-            r = np.array([cell.mean for cell in self.diagnosis.blocks[block].cells]) - at_b
+            r = np.array([cell.mean for cell in self.diagnosis.results.blocks[block].cells]) - at_b
             known = ~np.isnan(r)
             terms = [W[:, known] @ x[known] for x in (-q, -s, r)]
             for i, one in enumerate(terms):
@@ -605,25 +467,11 @@ class _Trial:
         inside = [low, high, *(x.real for x in roots if abs(x.imag) < 1e-9 and low < x.real < high)]
         return float(b + min(inside, key=lambda u: np.polyval(quartic, u)))
 
-    def _tried(self, mistakes: tuple[Mistake, ...], variant: Variant, means: _Means, at: float = 0.0) -> _Tried:
+    def _tried(self, mistakes: tuple[Mistake, ...], variant: Variant, means: Means, at: float = 0.0) -> _Tried:
         d, numbers = self.diagnosis, int(bool(variant.grid))
-        fit = d.judge(means, numbers)
-        apart = d.apart(means) if fit.p > WORTH else 0.0
+        fit = d.results.judge(means, numbers)
+        apart = d.results.apart(means) if fit.p > WORTH else 0.0
         return _Tried(mistakes, variant, fit, at, numbers, apart)
-
-
-def _unlike(one: np.ndarray, other: np.ndarray, slack: float) -> float:
-    """4 λ² of Kolmogorov and Smirnov's test of two samples, whose values may be off by some slack."""
-    one, other = np.sort(one), np.sort(other)
-
-    def below(sample: np.ndarray, x: np.ndarray) -> np.ndarray:
-        return np.searchsorted(sample, x, side="right") / len(sample)
-
-    far = max(
-        float((below(one, one) - below(other, one + slack)).max(initial=0.0)),
-        float((below(other, other) - below(one, other + slack)).max(initial=0.0)),
-    )
-    return 4.0 * far**2 * len(one) * len(other) / (len(one) + len(other))
 
 
 def _together(one: _Tried, other: _Tried) -> Iterator[Variant]:
@@ -642,34 +490,6 @@ def _together(one: _Tried, other: _Tried) -> Iterator[Variant]:
                 yield Variant(of, first.grid, first.shown)
         else:
             yield second
-
-
-def _hotelling(r: np.ndarray, C: np.ndarray, runs: float) -> tuple[float, int]:
-    """T² as a χ² of equal probability, and its freedom; directions that hardly vary are rounding."""
-    from scipy.special import chdtri, fdtrc
-
-    if not len(r):
-        return 0.0, 0
-    deviation = np.sqrt(np.diagonal(C))
-    correlation = C / np.outer(deviation, deviation)
-    # few runs know less of a correlation than of a deviation
-    shrink = min(1.0, len(r) / max(runs, 1.0))
-    values, vectors = np.linalg.eigh((1.0 - shrink) * correlation + shrink * np.eye(len(r)))
-    firm = values > FIRM
-    T = float((((vectors.T @ (r / deviation))[firm]) ** 2 / values[firm]).sum())
-    d = int(firm.sum())
-    if runs <= d + 2:
-        return T, d
-    p = float(fdtrc(d, runs - d, T * (runs - d) / (d * (runs - 1.0))))
-    return (float(chdtri(d, p)) if p > 1e-280 else T), d
-
-
-def _covariance_of(X: np.ndarray) -> np.ndarray:
-    C = np.atleast_2d(np.cov(X, rowvar=False))
-    tiny = 1e-24 * np.maximum(np.abs(X).max(axis=0) ** 2, 1e-300)
-    still = np.diagonal(C) <= tiny
-    C[still] = C[:, still] = 0.0
-    return C
 
 
 def _curve(
