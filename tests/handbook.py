@@ -42,6 +42,9 @@ CHAPTERS = {
     "What a simulator's values are distributed like": "data.expected",
     "How a simulator's cells are judged": "data.cells",
     "All cells together": "data.together",
+    "What is wrong with a simulator": "data.causes",
+    "How well numbers explain it": "data.fits",
+    "What a simulator with a mistake would show": "data.supposed",
 }
 
 

@@ -88,7 +88,6 @@ def crosscheck(
     results = read_results(file, renamed(columns))
     chosen, link = changes.of(scenario)
     verdict = check(results, chosen, method=method, metric=metric, alpha=alpha, link=link, **settings)
-    # what would explain a disagreement belongs here: verdict = replace(verdict, causes=…)
     shown = crosschecks.CrosscheckView(verdict, to.digits)
     for note in dict.fromkeys((*verdict.prediction.notes, *verdict.notes)):
         typer.echo(f"note: {note}", err=True)

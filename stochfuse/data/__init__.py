@@ -12,6 +12,10 @@ results beside the prediction and says what would explain a difference.
     expected                  what its values are distributed like
     cells, together           each cell judged, and all of them
     crosscheck                the verdict
+    mistakes, supposed        mistakes that people make, and what a simulator with one would show
+    blocks, fits, causes      which of them explains a verdict that disagrees
+
+A new mistake is one entry in `mistakes.MISTAKES`.
 
 The room knows files and the rooms below; it knows no table and no screen.
 """

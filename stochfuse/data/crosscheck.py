@@ -14,11 +14,12 @@ not give are never held against it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from stochfuse.data.causes import Cause, causes_of
 from stochfuse.data.cells import Cell, Judged, of_means, of_runs
 from stochfuse.data.columns import Labels
 from stochfuse.data.expected import Family, families_of, knows
@@ -56,7 +57,7 @@ class Verdict(Result):
     blocks : per link, how its cells hang together; empty where only means are given.
     evidence : what the file says that cannot be, in words.
     notes : what the reader should know, one sentence each.
-    causes : what would explain a disagreement, the likeliest first; see `stochfuse.report.crosschecks`.
+    causes : what would explain a disagreement, the likeliest first; see `stochfuse.data.causes`.
     results : what was checked.
     prediction : what it was checked against.
     metric : of columns that name none.
@@ -74,7 +75,7 @@ class Verdict(Result):
     blocks: tuple[Block, ...] = ()
     evidence: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    causes: tuple[Any, ...] = field(default=())
+    causes: tuple[Cause, ...] = ()
 
 
 def crosscheck(
@@ -87,6 +88,7 @@ def crosscheck(
     alpha: float = ALPHA,
     columns: Mapping[str, str] | None = None,
     link: Any = None,
+    causes: bool = True,
     **settings: Any,
 ) -> Verdict:
     """Check a simulator's results against the prediction.
@@ -102,6 +104,7 @@ def crosscheck(
     alpha : probability that a right simulator is called wrong.
     columns : names that the file has for columns, by those of `read_results`.
     link : link probability, for results without a column of it.
+    causes : whether to look for what would explain a disagreement, which takes some seconds.
     **settings : as for `predict`.
 
     Returns
@@ -156,7 +159,8 @@ def crosscheck(
             f"runs of estimator {whose}"
         )
     verdict = check_results(read, prediction, chosen, alpha, again)
-    return replace(verdict, notes=(*said, *verdict.notes))
+    verdict = replace(verdict, notes=(*said, *verdict.notes))
+    return replace(verdict, causes=causes_of(verdict, rows)) if causes else verdict
 
 
 def _predicted(

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from stochfuse import __version__
+from stochfuse.data.causes import summary
 from stochfuse.data.crosscheck import Cell, Verdict
 from stochfuse.kalman.metrics import metric
 from stochfuse.report.plot import DASHES, MARKERS, below, figure_class, shades, spread, titled
@@ -22,7 +23,7 @@ from stochfuse.scenario.registry import OPTIMAL
 
 SCHEMA = "stochfuse.crosscheck/1"
 NEES = "Expected NEES: squared error in units of the claimed covariance"
-MOST_PANELS, ACROSS = 6, 3
+MOST_PANELS, ACROSS, MOST_CAUSES = 6, 3, 3
 LEAST_REACH = 4.0
 """z-scores up to which an axis of them reaches at least."""
 
@@ -72,6 +73,15 @@ class CrosscheckView:
         return NEES if quantity == "nees" else self.view(quantity, name).what
 
     @property
+    def causes(self) -> tuple[str, ...]:
+        """What would explain a disagreement, a line each: all in one, then the likeliest."""
+        found = self.verdict.causes
+        if not found:
+            return ()
+        likely = [cause for cause in found if cause.explains] or list(found[:1])
+        return (summary(found), *(f"  {cause.text}" for cause in likely[:MOST_CAUSES]))
+
+    @property
     def titles(self) -> tuple[str, ...]:
         """Lines that say what is compared with what."""
         v = self.verdict
@@ -80,6 +90,7 @@ class CrosscheckView:
         return (
             f"Crosscheck of {v.results.source}: {self.says}",
             *notes,
+            *self.causes,
             *(f"against: {self.what(*sense)}" for sense in self.senses),
             view.whom.partition(";")[0],
             view.how,
@@ -192,7 +203,7 @@ def crosscheck_json(shown: CrosscheckView) -> dict[str, Any]:
         ],
         "consistency": dict(v.consistency),
         "evidence": list(v.evidence),
-        "causes": [cause if isinstance(cause, dict) else cause._asdict() for cause in v.causes],
+        "causes": [cause._asdict() for cause in v.causes],
         "scenario": p.scenario.to_mapping(),
         "meta": {"description": list(shown.titles), "nature": p.nature, "notes": [*p.notes, *v.notes]},
     }
