@@ -62,7 +62,21 @@ def gain():
     return solutions.draw(solutions.gain_sheet(found), found)
 
 
+def simulated(preset, runs, **more):
+    changes = {key: more.pop(key) for key in ("steps", "agents") if key in more}
+    return sf.simulate(sf.load_scenario(preset, **changes), runs, link=0.5, predicted=False, **more).plot()
+
+
+def states(steps, link):
+    s = sf.load_scenario("cv-2d", steps=steps, agents=2)
+    return sf.expected_states(s, np.ones((steps, 2, 2)), link, "general").plot()
+
+
 FIGURES = {
+    "run": lambda: simulated("thesis-steady", 20, steps=12, agents=2, estimator=["local-fusion-graph", "naive"]),
+    "run of many agents": lambda: simulated("thesis-transient", 1, steps=5, agents=6, estimator="stand-alone"),
+    "run of sensors by name": lambda: simulated("two-radars", 3, steps=30, estimator=["optimal", "split-ci"]),
+    "states": lambda: states(3, [0, 0.5, 1]),
     "prediction": lambda: predictions.draw(view()),
     "many steps": lambda: predictions.draw(view(steps=40)),
     "one row": lambda: predictions.draw(view(link=[0.5])),
@@ -134,7 +148,8 @@ def test_no_text_lies_on_another(drawn):
 
 def test_both_axes_are_named(drawn):
     for axes in drawn[0].axes:
-        assert axes.get_xlabel()
+        # of panels above each other the lowest names the axis for all
+        assert any(other.get_xlabel() for other in axes.get_shared_x_axes().get_siblings(axes))
         assert axes.get_ylabel()
 
 

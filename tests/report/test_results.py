@@ -27,6 +27,11 @@ RESULTS = {
     "gain": lambda: sf.share_of_gain(MINE, [0.5]),
     "load": lambda: sf.message_load(MINE, [0.5]),
     "links": lambda: sf.links({"seq": [1, 2, 3], "sender": ["1"] * 3, "receiver": ["NA"] * 3, "received": [1, 0, 1]}),
+    "run": lambda: sf.simulate(MINE, 20, link=0.5, estimator=["naive", "optimal"]),
+    "states": lambda: sf.expected_states(MINE, np.ones((3, 3, 1)), [0, 0.5], "general"),
+    "verdict": lambda: sf.crosscheck(
+        {"link": [0.5], "step": [1], "covariance": [7.0], "count": [100]}, MINE, causes=False
+    ),
     "study": lambda path: sf.study({"vary": {"network.link": [0, 0.5, 1]}}, path / "study.parquet"),
 }
 
