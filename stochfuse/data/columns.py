@@ -31,9 +31,9 @@ from stochfuse.data.tables import (
     WHOLE,
     ColumnsError,
     Labels,
-    Numbers,
+    NumberColumn,
+    OpenedTable,
     Raw,
-    Table,
     opened,
     plain,
 )
@@ -206,7 +206,7 @@ def _parts(source: Any, fields: Fields, renamed: Mapping[str, str], others: bool
         yield from _parts_of(opened(source, stack), fields, renamed, others)
 
 
-def _parts_of(table: Table, fields: Fields, renamed: Mapping[str, str], others: bool) -> Iterator[Columns]:
+def _parts_of(table: OpenedTable, fields: Fields, renamed: Mapping[str, str], others: bool) -> Iterator[Columns]:
     places, wanted, skipped = _matched(table, fields, renamed, others)
     known: dict[str, dict[str, int]] = {field.name: {} for field in wanted}
     kinds = {place: field.kind for place, field in zip(places, wanted, strict=True)}
@@ -241,7 +241,7 @@ def _names(wanted: Sequence[Field]) -> str:
 
 
 def _matched(
-    table: Table, fields: Fields, renamed: Mapping[str, str], others: bool
+    table: OpenedTable, fields: Fields, renamed: Mapping[str, str], others: bool
 ) -> tuple[list[int], list[Field], tuple[str, ...]]:
     """Places and fields of the columns that are wanted and there, and the names of the others."""
     header = list(table.header)
@@ -317,7 +317,7 @@ def _checked(
                 raise part.error(row, field.name, field.expected, repr(raw.cell(row, place)))
             text[field.name] = labels
             continue
-        values, empty, wrong = found if isinstance(found, Numbers) else _numbers(found)
+        values, empty, wrong = found if isinstance(found, NumberColumn) else _numbers(found)
         bad = np.zeros(len(values), dtype=bool) if field.free else ~np.isfinite(values) | (values < field.least)
         if field.kind == WHOLE:
             bad |= values != np.round(values)
@@ -349,23 +349,23 @@ def _empty(cell: Any) -> bool:
     return type(cell).__name__ in ("NAType", "NaTType")
 
 
-def _numbers(cells: Sequence[Any] | np.ndarray) -> Numbers:
+def _numbers(cells: Sequence[Any] | np.ndarray) -> NumberColumn:
     """Cells of any kind as numbers; not-a-number that is no text is an empty cell."""
     none = np.zeros(len(cells), dtype=bool)
     if isinstance(cells, np.ndarray) and cells.dtype.kind in "iuf":
         values = cells.astype(float)
-        return Numbers(values, np.isnan(values), none)
+        return NumberColumn(values, np.isnan(values), none)
     kinds = set(map(type, cells))
     if kinds <= {int, float}:
         return _numbers(np.array(cells, dtype=float))
     if kinds == {str}:
         try:
-            return Numbers(np.array(cells, dtype=float), none, none)
+            return NumberColumn(np.array(cells, dtype=float), none, none)
         except ValueError:
             texts = np.char.strip(np.array(cells, dtype=str))
             empty = texts == ""
             try:
-                return Numbers(np.where(empty, "nan", texts).astype(float), empty, none)
+                return NumberColumn(np.where(empty, "nan", texts).astype(float), empty, none)
             except ValueError:
                 pass
     found = [_number(cell) for cell in cells]
@@ -373,7 +373,7 @@ def _numbers(cells: Sequence[Any] | np.ndarray) -> Numbers:
     empty = np.array([_empty(cell) or (number != number and not isinstance(cell, str))
                       for cell, number in zip(cells, found, strict=True)], dtype=bool)  # fmt: skip
     wrong = np.array([number is None for number in found], dtype=bool) & ~empty
-    return Numbers(values, empty, wrong)
+    return NumberColumn(values, empty, wrong)
 
 
 def _labelled(cells: Any) -> Labels:

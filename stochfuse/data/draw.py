@@ -22,7 +22,7 @@ import numpy as np
 from stochfuse.data.records import arrivals_of
 from stochfuse.engines.events import events
 from stochfuse.engines.monte_carlo import draw_fates
-from stochfuse.engines.replay import Arrivals
+from stochfuse.engines.replay import ArrivalRecord
 from stochfuse.errors import UsageError
 from stochfuse.estimators.protocol import Late
 from stochfuse.estimators.readings import Function, Readings
@@ -56,7 +56,7 @@ class Drawn(NamedTuple):
     first: tuple[np.ndarray, ...]
 
 
-def drawn_arrivals(system: System, links: LinkRows, missed: np.ndarray, seed: int, first: int = 0) -> Arrivals:
+def drawn_arrivals(system: System, links: LinkRows, missed: np.ndarray, seed: int, first: int = 0) -> ArrivalRecord:
     """Draw what arrives in some runs.
 
     Parameters

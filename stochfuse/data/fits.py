@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtrc, chdtri, fdtrc
 
-from stochfuse.data.supposed import CLAIMED, Block
+from stochfuse.data.supposed import CLAIMED, Findings
 
 MOST_APART = 100.0
 """Most that the spread of one cell counts."""
@@ -54,7 +54,7 @@ class Means(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Results:
+class Fits:
     """A simulator's results, and how well numbers explain them.
 
     Parameters
@@ -62,7 +62,7 @@ class Results:
     blocks : one for each link probability.
     """
 
-    blocks: tuple[Block, ...]
+    blocks: tuple[Findings, ...]
 
     @property
     def errors(self) -> bool:

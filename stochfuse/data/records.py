@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.data.columns import TEXT, WHOLE, Columns, ColumnsError, Field, Labels, read_columns
-from stochfuse.engines.replay import Arrivals
+from stochfuse.engines.replay import ArrivalRecord
 from stochfuse.errors import StochfuseError, UsageError, nearest
 from stochfuse.estimators.protocol import Late
 from stochfuse.scenario.network import reachable
@@ -37,7 +37,7 @@ NUMBERS = 400_000
 """Agents times steps of a batch of runs."""
 
 
-class Rows(NamedTuple):
+class RunRows(NamedTuple):
     """A table's rows in the order of runs.
 
     Parameters
@@ -78,7 +78,7 @@ class Batch(NamedTuple):
     runs: np.ndarray
     z: tuple[np.ndarray, ...]
     relations: dict[tuple[int, int], np.ndarray]
-    arrivals: Arrivals | None
+    arrivals: ArrivalRecord | None
     missed: np.ndarray
     truth: np.ndarray | None
     first: tuple[np.ndarray, ...]
@@ -99,11 +99,11 @@ class Records:
 
     scenario: Scenario
     names: tuple[str, ...]
-    measurements: Rows
-    relations: Rows
-    arrivals: Rows | None
-    truth: Rows | None
-    first: Rows | None
+    measurements: RunRows
+    relations: RunRows
+    arrivals: RunRows | None
+    truth: RunRows | None
+    first: RunRows | None
     known: np.ndarray
     notes: tuple[str, ...]
 
@@ -209,7 +209,7 @@ def _first(rows: tuple[np.ndarray, np.ndarray, np.ndarray], count: int, n: int, 
     return out
 
 
-def _arrivals(rows: tuple[np.ndarray, np.ndarray, np.ndarray], missed: np.ndarray) -> Arrivals:
+def _arrivals(rows: tuple[np.ndarray, np.ndarray, np.ndarray], missed: np.ndarray) -> ArrivalRecord:
     run, where, _ = rows
     step, receiver, sender, sent = where.T
     prompt = step == sent
@@ -223,7 +223,7 @@ def _arrivals(rows: tuple[np.ndarray, np.ndarray, np.ndarray], missed: np.ndarra
 
 def arrivals_of(
     heard: np.ndarray, missed: np.ndarray, late: Mapping[tuple[int, int], tuple[Late, ...]] | None = None
-) -> Arrivals:
+) -> ArrivalRecord:
     """Return arrivals as the estimators take them.
 
     Parameters
@@ -240,7 +240,7 @@ def arrivals_of(
     np.bitwise_or.at(masks, (run, step, receiver), bits[sender])
     which = (missed * bits).sum(axis=-1)
     listed = [[tuple(row) for row in of_run] for of_run in masks.tolist()]
-    return Arrivals(listed, which.tolist(), late or {})
+    return ArrivalRecord(listed, which.tolist(), late or {})
 
 
 def read_records(
@@ -293,8 +293,8 @@ def read_records(
     )
 
 
-def _taken(rows: Rows, which: np.ndarray) -> Rows:
-    return Rows(None if rows.run is None else rows.run[which], rows.where[which], rows.values[which])
+def _taken(rows: RunRows, which: np.ndarray) -> RunRows:
+    return RunRows(None if rows.run is None else rows.run[which], rows.where[which], rows.values[which])
 
 
 def _lengthened(scenario: Scenario, last: int, tables: Mapping[str, _Given]) -> Scenario:
@@ -354,14 +354,14 @@ class _Given(NamedTuple):
         """Largest step."""
         return int(self.where[:, 0].max(initial=0)) + 1
 
-    def rows(self, names: Sequence[str]) -> Rows:
+    def rows(self, names: Sequence[str]) -> RunRows:
         """In the order of runs."""
         if self.run is None:
-            return Rows(None, self.where, self.values)
+            return RunRows(None, self.where, self.values)
         place = {name: i for i, name in enumerate(names)}
         run = np.array([place[name] for name in self.run.names])[self.run.codes]
         order = np.argsort(run, kind="stable")
-        return Rows(run[order], self.where[order], self.values[order])
+        return RunRows(run[order], self.where[order], self.values[order])
 
 
 class _Reader:

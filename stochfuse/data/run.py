@@ -23,8 +23,8 @@ import numpy as np
 from stochfuse.data.consistency import Average, Series, band
 from stochfuse.data.draw import drawn_arrivals
 from stochfuse.data.records import Batch, read_records
-from stochfuse.engines.progress import listener
-from stochfuse.engines.replay import Arrivals, Stage, moments_given, replay
+from stochfuse.engines.progress import listener, within
+from stochfuse.engines.replay import ArrivalRecord, Stage, moments_given, replay
 from stochfuse.errors import StochfuseError, UsageError, nearest
 from stochfuse.estimators.readings import Readings
 from stochfuse.kalman.metrics import Metric
@@ -296,20 +296,19 @@ def run_records(
             "arrivals are drawn from the scenario's links: expected one link probability; give --link or --arrivals"
         )
     tallies = {name: Tally(records, name, way.criterion) for name in way.estimators}
-    done, total = 0, len(records.names) * len(way.estimators)
-    heard = None
+    heard, done = None, 0
     for batch in records.batches():
         arrivals = batch.arrivals
         if arrivals is None:
             arrivals = drawn_arrivals(scenario.system, links, batch.missed, way.seed, int(batch.runs[0]))  # type: ignore[arg-type]
         heard = _heard(arrivals) if heard is None else heard
+        done += len(batch.runs)
         for tally in tallies.values():
-            tally.add(batch, arrivals, write)
-            done += len(batch.runs)
-            listener().advance("running estimators", done, total)
+            with within(f"runs up to {done:,}", done, len(records.names)):
+                tally.add(batch, arrivals, write)
     rows, notes = [], list(records.notes)
     for tally in tallies.values():
-        expected = _expected(scenario, links, tally.estimator, way) if way.predicted else Expected(None, "", ())
+        expected = _expected(scenario, links, tally.estimator, way) if way.predicted else PredictedSquare(None, "", ())
         notes += [*expected.notes, *tally.notes]
         rows += tally.rows(metric, expected, _link(links))
     if heard is None:
@@ -332,13 +331,15 @@ def _link(links: LinkRows | None) -> float | None:
     return float(links.link[0]) if alike else None  # type: ignore[union-attr]
 
 
-def _heard(arrivals: Arrivals) -> np.ndarray:
+def _heard(arrivals: ArrivalRecord) -> np.ndarray:
     n = len(arrivals.heard[0][0])
     rows = [[[mask >> j & 1 for j in range(n)] for mask in masks] for masks in arrivals.heard[0]]
     return np.array(rows, dtype=bool) & ~np.eye(n, dtype=bool)
 
 
-def stages(records: RecordsLike, batch: Batch, arrivals: Arrivals, estimator: str, criterion: str) -> Iterator[Stage]:
+def stages(
+    records: RecordsLike, batch: Batch, arrivals: ArrivalRecord, estimator: str, criterion: str
+) -> Iterator[Stage]:
     """Follow an estimator through a batch of records; extended where sensors are by name."""
     scenario = records.scenario
     readings = Readings.given(scenario.system, batch.z, batch.relations, scenario.instruments, batch.first)
@@ -368,7 +369,7 @@ class Tally:
         self._given, self._given_count = np.zeros((steps, n, d, d)), 0
         self._shown: list[np.ndarray] = []
 
-    def add(self, batch: Batch, arrivals: Arrivals, write: Callable[[Estimates], None] | None) -> None:
+    def add(self, batch: Batch, arrivals: ArrivalRecord, write: Callable[[Estimates], None] | None) -> None:
         """Run a batch."""
         system, known = self.records.scenario.system, self.records.known
         shape = (len(batch.runs), system.steps, system.agents)
@@ -390,6 +391,7 @@ class Tally:
                 there = np.ones(x.shape[:2], dtype=bool)
             self._claim[k] += np.einsum("ra,raij->aij", there, P)
             self._count[k] += there.sum(axis=0)
+            listener().advance(f"{self.estimator}, steps", stage.step, system.steps)
             if first:
                 self._shown.append(np.stack([x[0], np.diagonal(P[0], axis1=-2, axis2=-1)]))
             if write is not None:
@@ -401,7 +403,7 @@ class Tally:
         self.nis.add(nis)
         self._add_given(arrivals)
 
-    def _add_given(self, arrivals: Arrivals) -> None:
+    def _add_given(self, arrivals: ArrivalRecord) -> None:
         """Expected squared error given what arrived, of as many runs as can be followed."""
         system = self.records.scenario.system
         left = FOLLOWED // (system.steps**2 * system.agents) - self._given_count
@@ -413,7 +415,7 @@ class Tally:
                     else f"{self.estimator}: the error given what arrived is not worked out for so many steps"
                 )
             return
-        some = Arrivals(arrivals.heard[:left], arrivals.missed[:left], arrivals.late)
+        some = ArrivalRecord(arrivals.heard[:left], arrivals.missed[:left], arrivals.late)
         try:
             found = moments_given(system, self.estimator, some, self.criterion)
         except (UsageError, MemoryError) as error:
@@ -423,7 +425,7 @@ class Tally:
         self._given += found.square.sum(axis=0)
         self._given_count += some.runs
 
-    def rows(self, metric: Metric, expected: Expected, link: float | None) -> list[Row]:
+    def rows(self, metric: Metric, expected: PredictedSquare, link: float | None) -> list[Row]:
         """What it comes to, the mean over the agents first."""
         n = self._square.shape[1]
         given = self._given / self._given_count if self._given_count > 0 else None
@@ -485,7 +487,7 @@ def _normalised(error: np.ndarray, P: np.ndarray) -> np.ndarray:
     return out
 
 
-class Expected(NamedTuple):
+class PredictedSquare(NamedTuple):
     """Expected squared error, (steps, agents, d, d), or None where it cannot be had; its method, and notes."""
 
     square: np.ndarray | None
@@ -493,11 +495,11 @@ class Expected(NamedTuple):
     notes: tuple[str, ...]
 
 
-def _expected(scenario: Scenario, links: LinkRows | None, estimator: str, way: Way) -> Expected:
+def _expected(scenario: Scenario, links: LinkRows | None, estimator: str, way: Way) -> PredictedSquare:
     """What is predicted from the scenario's links."""
 
-    def nothing(why: str) -> Expected:
-        return Expected(None, "", (f"{estimator}: nothing is predicted from the scenario's links: {why}",))
+    def nothing(why: str) -> PredictedSquare:
+        return PredictedSquare(None, "", (f"{estimator}: nothing is predicted from the scenario's links: {why}",))
 
     if links is None or len(links.link) > 1:
         return nothing("it has none of its own; see --link")
@@ -518,4 +520,4 @@ def _expected(scenario: Scenario, links: LinkRows | None, estimator: str, way: W
         if np.abs(last - before).max() > STEADY * np.abs(last).max():
             return nothing(f"the error is not steady at step {FAR}")
         square = np.concatenate([square, np.broadcast_to(last, (system.steps - FAR, *square.shape[1:]))])
-    return Expected(square, method, ())
+    return PredictedSquare(square, method, ())

@@ -49,7 +49,7 @@ class Labels(NamedTuple):
     names: tuple[str, ...]
 
 
-class Numbers(NamedTuple):
+class NumberColumn(NamedTuple):
     """Values, not-a-number where a cell is empty or is no number; and which are which."""
 
     values: np.ndarray
@@ -60,8 +60,8 @@ class Numbers(NamedTuple):
 class Raw(NamedTuple):
     """Some rows before they are checked.
 
-    `column` gives the values of a column by its place and kind: `Numbers`, `Labels`, or a sequence of cells that may
-    be anything; `cell` one cell as it was given, which may be asked for before the first column is.
+    `column` gives the values of a column by its place and kind: `NumberColumn`, `Labels`, or a sequence of cells that
+    may be anything; `cell` one cell as it was given, which may be asked for before the first column is.
     """
 
     length: int
@@ -71,7 +71,7 @@ class Raw(NamedTuple):
     firsts: np.ndarray
 
 
-class Table(NamedTuple):
+class OpenedTable(NamedTuple):
     """Where a table comes from, its headings, and its rows part by part, given places and kinds of what is wanted."""
 
     name: str
@@ -80,7 +80,7 @@ class Table(NamedTuple):
     parts: Callable[[Mapping[int, str]], Iterator[Raw]]
 
 
-def opened(source: Any, stack: ExitStack) -> Table:
+def opened(source: Any, stack: ExitStack) -> OpenedTable:
     """Return a table from wherever it is.
 
     Parameters
@@ -121,7 +121,7 @@ def opened(source: Any, stack: ExitStack) -> Table:
 # CSV
 
 
-def _of_bytes(name: str, stream: IO[bytes]) -> Table:
+def _of_bytes(name: str, stream: IO[bytes]) -> OpenedTable:
     """CSV, or JSON if it begins so."""
     head = stream.read(BLOCK)
     beginning = head.removeprefix(b"\xef\xbb\xbf").lstrip()[:1]
@@ -130,7 +130,7 @@ def _of_bytes(name: str, stream: IO[bytes]) -> Table:
     blocks = _blocks(name, head, stream)
     first = next(blocks, None)
     if first is None:
-        return Table(name, "line", (), lambda _: iter(()))
+        return OpenedTable(name, "line", (), lambda _: iter(()))
     heading, _, rest = first.text.partition(b"\n")
     separator = max(",;\t", key=heading.decode().count)
     header = tuple(cell.strip() for cell in _cells_of(heading, separator))
@@ -145,7 +145,7 @@ def _of_bytes(name: str, stream: IO[bytes]) -> Table:
         for block in blocks:
             yield _csv_part(name, block, header, separator, kinds)
 
-    return Table(name, "line", header, parts)
+    return OpenedTable(name, "line", header, parts)
 
 
 class _Block(NamedTuple):
@@ -298,7 +298,7 @@ def _of_arrow(column: Any, kind: str) -> Any:
         values = column.cast(pa.float64(), safe=False)
         empty = values.is_null().to_numpy(zero_copy_only=False)
         filled = values.fill_null(np.nan).to_numpy(zero_copy_only=False).copy()
-        return Numbers(filled, empty, np.zeros(len(filled), dtype=bool))
+        return NumberColumn(filled, empty, np.zeros(len(filled), dtype=bool))
     return column.to_pylist()
 
 
@@ -314,7 +314,7 @@ def _in_order(labels: Labels) -> Labels:
 # Parquet, JSON, arrays
 
 
-def _of_parquet(path: Path, stack: ExitStack) -> Table:
+def _of_parquet(path: Path, stack: ExitStack) -> OpenedTable:
     needed("pyarrow.parquet", "study", f"{path}: Parquet needs")
     pq, pa = import_module("pyarrow.parquet"), import_module("pyarrow")
     try:
@@ -335,10 +335,10 @@ def _of_parquet(path: Path, stack: ExitStack) -> Table:
             )
             done += batch.num_rows
 
-    return Table(str(path), "record", header, parts)
+    return OpenedTable(str(path), "record", header, parts)
 
 
-def _of_json(name: str, text: bytes) -> Table:
+def _of_json(name: str, text: bytes) -> OpenedTable:
     try:
         made = json.loads(text.removeprefix(b"\xef\xbb\xbf").decode())
     except UnicodeDecodeError as error:
@@ -366,7 +366,7 @@ def _of_records(name: str, records: list[Any]) -> dict[str, list[Any]]:
     return {key: [record[key] for record in records] for key in header}
 
 
-def _of_arrays(source: Any) -> Table:
+def _of_arrays(source: Any) -> OpenedTable:
     """A mapping of arrays, or a data frame."""
     name = "data frame" if not isinstance(source, Mapping) else "arrays"
     names = list(source if isinstance(source, Mapping) else getattr(source, "columns", ()))
@@ -390,7 +390,7 @@ def _of_arrays(source: Any) -> Table:
     return _of_lists(name, "row", 0, columns)
 
 
-def _of_lists(name: str, what: str, first: int, columns: Mapping[str, Any]) -> Table:
+def _of_lists(name: str, what: str, first: int, columns: Mapping[str, Any]) -> OpenedTable:
     header = tuple(key.strip() for key in columns)
     lists = list(columns.values())
     length = len(lists[0]) if lists else 0
@@ -405,7 +405,7 @@ def _of_lists(name: str, what: str, first: int, columns: Mapping[str, Any]) -> T
                 np.array([start + first]),
             )
 
-    return Table(name, what, header, parts)
+    return OpenedTable(name, what, header, parts)
 
 
 def _list_part(cells: Any, kind: str) -> Any:

@@ -19,7 +19,7 @@ import numpy as np
 from stochfuse.data.records import Batch
 from stochfuse.data.run import Estimates
 from stochfuse.data.tables import SUFFIXES
-from stochfuse.engines.replay import Arrivals
+from stochfuse.engines.replay import ArrivalRecord
 from stochfuse.errors import UsageError, needed
 from stochfuse.scenario.scenario import Scenario
 
@@ -29,7 +29,7 @@ MEASUREMENTS, ARRIVALS, TRUTH, FIRST, ESTIMATES = (
 """Names of the files of a run."""
 
 
-class Table:
+class GrowingTable:
     """A CSV or Parquet file that is written row by row, and there only once it is complete.
 
     Parameters
@@ -45,7 +45,7 @@ class Table:
         if path.suffix.lower() in SUFFIXES:
             needed("pyarrow.parquet", "study", f"{path}: Parquet needs")
 
-    def __enter__(self) -> Table:
+    def __enter__(self) -> GrowingTable:
         try:
             if self.path.suffix.lower() not in SUFFIXES:
                 self._stream = self._partial.open("w", encoding="utf-8", newline="")
@@ -111,7 +111,7 @@ class EstimatesFile:
         self._pairs = [(i, j) for j in range(len(states)) for i in range(j)] if covariance else []
         named = [f"cov:{states[i]}:{states[j]}" for i, j in self._pairs]
         headings = ["run", "step", "agent", "estimator", *states, *(f"var:{s}" for s in states), *named]
-        self.table = Table(path, [*headings, *(["nees"] if truth else [])])
+        self.table = GrowingTable(path, [*headings, *(["nees"] if truth else [])])
 
     def __enter__(self) -> EstimatesFile:
         self.table.__enter__()
@@ -155,10 +155,10 @@ class RecordFiles:
         self._own = not system.one_state
         of = ["of"] if system.relations else []
         z = [f"z{i}" for i in range(1, self._most + 1)]
-        self.measurements = Table(folder / MEASUREMENTS, ["run", "step", "agent", *of, *z])
-        self.arrivals = Table(folder / ARRIVALS, ["run", "step", "receiver", "sender", "sent_step"])
-        self.truth = Table(folder / TRUTH, ["run", "step", *(["agent"] if self._own else []), *states])
-        self.first = Table(folder / FIRST, ["run", "agent", *states])
+        self.measurements = GrowingTable(folder / MEASUREMENTS, ["run", "step", "agent", *of, *z])
+        self.arrivals = GrowingTable(folder / ARRIVALS, ["run", "step", "receiver", "sender", "sent_step"])
+        self.truth = GrowingTable(folder / TRUTH, ["run", "step", *(["agent"] if self._own else []), *states])
+        self.first = GrowingTable(folder / FIRST, ["run", "agent", *states])
         self._stack = ExitStack()
 
     def __enter__(self) -> RecordFiles:
@@ -210,7 +210,7 @@ class RecordFiles:
         values = np.concatenate(padded)[order]
         self.measurements.add([runs[run[order]], step[order] + 1, self._agents[agent[order]], *related, *values.T])
 
-    def _write_arrivals(self, arrivals: Arrivals, runs: np.ndarray) -> None:
+    def _write_arrivals(self, arrivals: ArrivalRecord, runs: np.ndarray) -> None:
         rows = []
         for run, of_run in enumerate(arrivals.heard):
             for step, masks in enumerate(of_run, start=1):

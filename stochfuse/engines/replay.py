@@ -38,7 +38,7 @@ WRITTEN = 20_000
 
 
 @dataclass(frozen=True, eq=False)
-class Arrivals:
+class ArrivalRecord:
     """What arrived, and which sensors missed, in some runs.
 
     Parameters
@@ -81,7 +81,7 @@ class Stage(NamedTuple):
 
 
 def replay(
-    system: System, name: str, arrivals: Arrivals, readings: Readings, criterion: str = "det"
+    system: System, name: str, arrivals: ArrivalRecord, readings: Readings, criterion: str = "det"
 ) -> Iterator[Stage]:
     """Follow an estimator through records.
 
@@ -132,7 +132,7 @@ def written(estimator: Any) -> int:
 
 
 def _exchanged(
-    estimator: Any, states: Sequence[Any], state_of: np.ndarray, arrivals: Arrivals, step: int
+    estimator: Any, states: Sequence[Any], state_of: np.ndarray, arrivals: ArrivalRecord, step: int
 ) -> tuple[np.ndarray, list[Any], np.ndarray]:
     """Values claimed, (runs, agents), the different states before the next exchange, and that of each run."""
     last = step == arrivals.steps
@@ -165,7 +165,7 @@ class _Predictions:
         self.measured = np.array([z.shape[-1] for z in readings.z])
         self.nis = np.full((len(readings.z[0]), system.agents), np.nan)
 
-    def go_on(self, step: int, claimed: Sequence[Estimate], arrivals: Arrivals) -> None:
+    def go_on(self, step: int, claimed: Sequence[Estimate], arrivals: ArrivalRecord) -> None:
         """Predict what was claimed to the next step, linearise sensors there, and meet its measurements."""
         runs = np.arange(arrivals.runs)
         readings = self.readings.of(runs)
@@ -189,7 +189,7 @@ class _Predictions:
         self.nis = out
 
 
-def moments_given(system: System, name: str, arrivals: Arrivals, criterion: str = "det") -> Moments:
+def moments_given(system: System, name: str, arrivals: ArrivalRecord, criterion: str = "det") -> Moments:
     """Claimed covariance, actual covariance and bias of the errors given what arrived, whatever is measured.
 
     Parameters
@@ -218,7 +218,7 @@ def moments_given(system: System, name: str, arrivals: Arrivals, criterion: str 
     return Moments(*(None if part[0] is None else np.stack(part, axis=1) for part in zip(*stages, strict=True)))  # pyright: ignore[reportArgumentType]
 
 
-def require(system: System, name: str, arrivals: Arrivals, extended: bool = False) -> None:
+def require(system: System, name: str, arrivals: ArrivalRecord, extended: bool = False) -> None:
     """Raise UsageError if an estimator does not take a system, or a record of it.
 
     Parameters

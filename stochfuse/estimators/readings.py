@@ -171,7 +171,7 @@ class Readings:
         self.z[agent][:, step - 1] = (f.residual(z, f.h(prior, step)) + H @ prior)[..., 0]
 
 
-class Numbers(Protocol):
+class RunNumbers(Protocol):
     """Numbers of (value, run) pairs of an estimator; see `numbers_of`."""
 
     def work(self, values: np.ndarray, runs: np.ndarray) -> None:
@@ -186,12 +186,12 @@ class Numbers(Protocol):
         """Forget all other pairs."""
         ...
 
-    def renamed(self, estimator: Any, names: Mapping[int, int]) -> Numbers:
+    def renamed(self, estimator: Any, names: Mapping[int, int]) -> RunNumbers:
         """Return the same for an estimator that has other numbers for these values and no past."""
         ...
 
 
-def numbers_of(estimator: Any, system: System, readings: Readings, runs: int) -> Numbers:
+def numbers_of(estimator: Any, system: System, readings: Readings, runs: int) -> RunNumbers:
     """Return what the values of an estimator come to.
 
     Parameters

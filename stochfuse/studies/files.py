@@ -178,7 +178,7 @@ def check_format(path: Path) -> None:
             raise UsageError(NO_PARQUET) from None
 
 
-class Columns:
+class PlanColumns:
     """The columns of a plan's file, chunk by chunk."""
 
     def __init__(self, plan: Plan) -> None:
@@ -223,7 +223,7 @@ def write_result(plan: Plan, answers: Iterator[tuple[range, Answers]], path: Pat
     dict
         Numbers of points, rows and failed points, and the first reasons.
     """
-    columns, rows, failed = Columns(plan), 0, 0
+    columns, rows, failed = PlanColumns(plan), 0, 0
     first: list[tuple[int, str]] = []
     with (_Parquet if path.suffix.lower() == ".parquet" else _Csv)(path, columns) as file:
         for points, found in answers:
@@ -236,7 +236,7 @@ def write_result(plan: Plan, answers: Iterator[tuple[range, Answers]], path: Pat
 class _Parquet:
     """A Parquet file that is being written."""
 
-    def __init__(self, path: Path, columns: Columns) -> None:
+    def __init__(self, path: Path, columns: PlanColumns) -> None:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
@@ -280,7 +280,7 @@ def _label(labels: Mapping[str, str], name: str) -> dict[str, str] | None:
 class _Csv:
     """A CSV file that is being written."""
 
-    def __init__(self, path: Path, columns: Columns) -> None:
+    def __init__(self, path: Path, columns: PlanColumns) -> None:
         self.path, self.names = path, columns.names
 
     def __enter__(self) -> _Csv:
