@@ -11,7 +11,7 @@ import numpy as np
 
 from stochfuse.data.columns import Labels
 from stochfuse.data.results import SimulatorResults, dense
-from stochfuse.data.supposed import SQUARED, Finding, Findings
+from stochfuse.data.supposed import SQUARED, CellMean, LinkMeans
 from stochfuse.kalman.metrics import metric
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ COMPLETE = 0.5
 """Share of runs with a value in every cell from which on the runs are taken."""
 
 
-def blocks_behind(verdict: Verdict) -> tuple[Findings, ...]:
+def blocks_behind(verdict: Verdict) -> tuple[LinkMeans, ...]:
     """Return the cells of every link probability, of the first steps, with what each run has."""
     if not verdict.cells:
         return ()
@@ -40,7 +40,7 @@ def blocks_behind(verdict: Verdict) -> tuple[Findings, ...]:
             sense = model.states[0] if cell.metric == "nees" else None
             resolution = resolutions[cell.column]
             cells.append(
-                Finding(
+                CellMean(
                     quantity=cell.quantity,
                     metric=metric(cell.metric if sense is None else f"var:{sense}", model),
                     step=cell.step,
@@ -56,7 +56,7 @@ def blocks_behind(verdict: Verdict) -> tuple[Findings, ...]:
             columns.append((cell.column, cell.step, cell.agents, squared))
         if cells:
             values = None if results.run is None else _values(results, who, row, columns)
-            found.append(Findings(mine[0].link, row, tuple(cells), values))
+            found.append(LinkMeans(mine[0].link, row, tuple(cells), values))
     return tuple(found)
 
 

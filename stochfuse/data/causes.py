@@ -34,7 +34,7 @@ import numpy as np
 from stochfuse.data.blocks import blocks_behind
 from stochfuse.data.fits import ROUNDING, Fit, Fits, Means, covariance_of
 from stochfuse.data.mistakes import DEPENDENT, MISTAKES, WRONG_LINK, Mistake, Variant
-from stochfuse.data.supposed import CLAIMED, ERROR, SQUARED, Finding, Findings, Sampler, Simulator, exactly
+from stochfuse.data.supposed import CLAIMED, ERROR, SQUARED, CellMean, LinkMeans, Sampler, Simulator, exactly
 from stochfuse.engines.distribution import Distribution
 from stochfuse.engines.progress import listener
 from stochfuse.errors import StochfuseError
@@ -114,7 +114,7 @@ class _Tried(NamedTuple):
 def diagnose(
     prediction: Prediction,
     rows: LinkRows,
-    blocks: Sequence[Findings],
+    blocks: Sequence[LinkMeans],
     *,
     alpha: float = ALPHA,
 ) -> tuple[Cause, ...]:
@@ -146,7 +146,7 @@ def _by_agents(numbers: Sequence[int], prediction: Prediction) -> int:
     return numbers[min(len(prediction.group_of), len(numbers)) - 1]
 
 
-def _fewer(prediction: Prediction, rows: LinkRows, blocks: Sequence[Findings]) -> tuple[LinkRows, System, Fits]:
+def _fewer(prediction: Prediction, rows: LinkRows, blocks: Sequence[LinkMeans]) -> tuple[LinkRows, System, Fits]:
     """As many links, steps and cells as are enough."""
     most = LINKS if len(prediction.group_of) <= FEW else LINKS // 2
     blocks = [blocks[i] for i in np.unique(np.linspace(0, len(blocks) - 1, min(most, len(blocks))).astype(int))]
@@ -158,7 +158,7 @@ def _fewer(prediction: Prediction, rows: LinkRows, blocks: Sequence[Findings]) -
         here = [i for i, cell in enumerate(block.cells) if cell.step <= last]
         here = [here[i] for i in np.unique(np.linspace(0, len(here) - 1, min(CELLS, len(here))).astype(int))]
         values = None if block.values is None else block.values[:, here]
-        found.append(Findings(block.link, number, tuple(block.cells[i] for i in here), values))
+        found.append(LinkMeans(block.link, number, tuple(block.cells[i] for i in here), values))
     chosen = rows.take(np.array([block.row for block in blocks]))
     if chosen.varies:
         chosen = replace(chosen, link=chosen.link[:, :last])
@@ -493,7 +493,7 @@ def _together(one: _Tried, other: _Tried) -> Iterator[Variant]:
 
 
 def _curve(
-    prediction: Prediction, rows: LinkRows, blocks: Sequence[Findings]
+    prediction: Prediction, rows: LinkRows, blocks: Sequence[LinkMeans]
 ) -> Callable[[np.ndarray], list[np.ndarray]] | None:
     """What is expected of link probabilities (points,), per block (points, cells); None where it is no polynomial."""
     outcomes = prediction.outcomes
@@ -502,7 +502,7 @@ def _curve(
     if prediction.scenario.network.agents < 2:
         return None
 
-    def one(cell: Finding, µ: np.ndarray) -> np.ndarray:
+    def one(cell: CellMean, µ: np.ndarray) -> np.ndarray:
         groups = sorted({int(prediction.group_of[a - 1]) for a in cell.agents})
         share = [sum(int(prediction.group_of[a - 1]) == g for a in cell.agents) for g in groups]
         states = list(cell.metric.states)

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtrc, chdtri, fdtrc
 
-from stochfuse.data.supposed import CLAIMED, Findings
+from stochfuse.data.supposed import CLAIMED, LinkMeans
 
 MOST_APART = 100.0
 """Most that the spread of one cell counts."""
@@ -62,7 +62,7 @@ class Fits:
     blocks : one for each link probability.
     """
 
-    blocks: tuple[Findings, ...]
+    blocks: tuple[LinkMeans, ...]
 
     @property
     def errors(self) -> bool:

@@ -24,7 +24,7 @@ from stochfuse.data.supposed import (
     LOCAL,
     OWN_LOST,
     PRIOR,
-    Finding,
+    CellMean,
     Shown,
     Simulator,
 )
@@ -363,28 +363,28 @@ def _shown(s: Simulator, *some: Shown) -> Iterator[Variant]:
 
 
 def _times(
-    numbers: np.ndarray, cell: Finding, s: Simulator, *, of: Callable[[Finding, Simulator], float]
+    numbers: np.ndarray, cell: CellMean, s: Simulator, *, of: Callable[[CellMean, Simulator], float]
 ) -> np.ndarray:
     return numbers * of(cell, s)
 
 
-def _root(numbers: np.ndarray, cell: Finding, s: Simulator) -> np.ndarray:
+def _root(numbers: np.ndarray, cell: CellMean, s: Simulator) -> np.ndarray:
     return np.sqrt(np.maximum(numbers, 0.0))
 
 
-def _square(numbers: np.ndarray, cell: Finding, s: Simulator) -> np.ndarray:
+def _square(numbers: np.ndarray, cell: CellMean, s: Simulator) -> np.ndarray:
     return numbers**2
 
 
-def _inverse(numbers: np.ndarray, cell: Finding, s: Simulator) -> np.ndarray:
+def _inverse(numbers: np.ndarray, cell: CellMean, s: Simulator) -> np.ndarray:
     return 1.0 / numbers
 
 
-def _three(numbers: np.ndarray, cell: Finding, s: Simulator) -> np.ndarray:
+def _three(numbers: np.ndarray, cell: CellMean, s: Simulator) -> np.ndarray:
     return 3.0 * (np.sqrt(numbers) if cell.metric.squared else numbers)
 
 
-def _constant(numbers: np.ndarray, cell: Finding, s: Simulator, *, which: str) -> np.ndarray:
+def _constant(numbers: np.ndarray, cell: CellMean, s: Simulator, *, which: str) -> np.ndarray:
     k = min(cell.step, s.system.steps) - 1
     M = s.system.model.Q[k] if which == "Q" else s.system.sensors[s.system.sensor_of[cell.agents[0] - 1]].R[k]
     value = cell.metric.of(M) if len(M) == s.system.dimension else np.trace(M)

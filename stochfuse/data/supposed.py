@@ -50,7 +50,7 @@ MOST_AGENTS = 3
 """Agents up to which outcomes are listed."""
 
 
-class Finding(NamedTuple):
+class CellMean(NamedTuple):
     """A mean that a file has, of one link probability and step.
 
     Parameters
@@ -78,7 +78,7 @@ class Finding(NamedTuple):
     expected_error: float = 0.0
 
 
-class Findings(NamedTuple):
+class LinkMeans(NamedTuple):
     """The cells of one link probability, which are independent of those of others.
 
     Parameters
@@ -91,11 +91,11 @@ class Findings(NamedTuple):
 
     link: str
     row: int
-    cells: tuple[Finding, ...]
+    cells: tuple[CellMean, ...]
     values: np.ndarray | None = None
 
 
-Shown = Callable[[np.ndarray, Finding, "Simulator"], np.ndarray]
+Shown = Callable[[np.ndarray, CellMean, "Simulator"], np.ndarray]
 """What is shown in the place of some numbers of a cell."""
 
 
@@ -253,7 +253,7 @@ class Sampler:
     errors: bool = False
     _known: dict[Hashable, _Histories] = field(default_factory=dict)
 
-    def shown(self, simulator: Simulator, blocks: Sequence[Findings]) -> list[np.ndarray]:
+    def shown(self, simulator: Simulator, blocks: Sequence[LinkMeans]) -> list[np.ndarray]:
         """Return what a simulator shows in every run, (runs, cells), for each block; not-a-number where nobody knows.
 
         Raises
@@ -343,7 +343,7 @@ class _Reading:
     def __init__(self, simulator: Simulator) -> None:
         self.simulator = simulator
 
-    def place(self, cell: Finding) -> _Place:
+    def place(self, cell: CellMean) -> _Place:
         """Where the numbers of a cell come from."""
         s = self.simulator
         plain = s.claimed_only and cell.quantity != CLAIMED
@@ -356,7 +356,7 @@ class _Reading:
         """Whom, from 0, an agent's numbers show."""
         return self.simulator.whose[agent] - 1 if self.simulator.whose else agent
 
-    def numbers(self, cell: Finding, place: _Place, agent: int, m: Moments) -> np.ndarray:
+    def numbers(self, cell: CellMean, place: _Place, agent: int, m: Moments) -> np.ndarray:
         """Numbers of a cell from an agent's moments at a place."""
         seen = m if place.stage == FUSED else self._before(m, place.step + 1, agent, place.stage)
         numbers = self._number(cell, seen)
@@ -381,7 +381,7 @@ class _Reading:
             b = None if b is None else b - K @ (real.H @ b)
         return Moments(P) if A is None or b is None else Moments.of(P, A, b)
 
-    def _number(self, cell: Finding, m: Moments) -> np.ndarray:
+    def _number(self, cell: CellMean, m: Moments) -> np.ndarray:
         if cell.quantity == CLAIMED:
             return (self.simulator.metric or cell.metric).of(m.P)
         if cell.quantity == NEES:
@@ -402,11 +402,11 @@ class _Look:
         self._fused: dict[int, Moments] = {}
         self._seen: dict[Hashable, np.ndarray] = {}
 
-    def at(self, cell: Finding, row: int) -> np.ndarray:
+    def at(self, cell: CellMean, row: int) -> np.ndarray:
         """What every run of a row shows in a cell, (runs,)."""
         return np.mean([self._one(cell, row, self.reading.agent(a - 1)) for a in cell.agents], axis=0)
 
-    def _one(self, cell: Finding, row: int, agent: int) -> np.ndarray:
+    def _one(self, cell: CellMean, row: int, agent: int) -> np.ndarray:
         s, runs = self.simulator, self.histories.which.shape[1]
         if AS_IT_WAS in s.habits and cell.quantity != CLAIMED:
             # what was not brought forward is wrong by the true state's own motion, which no footprint knows
@@ -429,7 +429,7 @@ class _Look:
         return self._fused[step]
 
 
-def exactly(simulator: Simulator, blocks: Sequence[Findings]) -> list[np.ndarray] | None:
+def exactly(simulator: Simulator, blocks: Sequence[LinkMeans]) -> list[np.ndarray] | None:
     """Return what a simulator shows on average, (cells,) for each block, over all outcomes; None if they are too many.
 
     Of what is claimed, by simulators without habits.
@@ -448,7 +448,7 @@ def exactly(simulator: Simulator, blocks: Sequence[Findings]) -> list[np.ndarray
     found = outcomes(s.system, s.rows, Settings(estimator=s.estimator, criterion=s.criterion))
     seen: dict[Hashable, np.ndarray] = {}
 
-    def one(cell: Finding, agent: int) -> np.ndarray:
+    def one(cell: CellMean, agent: int) -> np.ndarray:
         place = reading.place(cell)
         if place.step == 0:
             start = reading.numbers(cell, place, agent, _start(s, False))

@@ -12,7 +12,7 @@ from stochfuse.data.causes import Cause, diagnose, independent_runs, summary
 from stochfuse.data.crosscheck import check_results
 from stochfuse.data.mistakes import MISTAKES
 from stochfuse.data.results import read_results
-from stochfuse.data.supposed import Finding, Findings
+from stochfuse.data.supposed import CellMean, LinkMeans
 from stochfuse.kalman.metrics import metric
 from stochfuse.scenario.scenario import link_rows
 from tests.cli.command import run as command
@@ -155,10 +155,10 @@ def test_the_door_takes_cells_of_ones_own():
     prediction, rows, m = sf.predict(s, [0.5], "general"), link_rows(s, [0.5]), metric("trace", s.model)
     expected = prediction.values("trace")[0]
     cells = tuple(
-        Finding("claimed", m, k + 1, (1, 2), 1000, 2 * float(expected[k]), 0.01, float(expected[k])) for k in range(3)
+        CellMean("claimed", m, k + 1, (1, 2), 1000, 2 * float(expected[k]), 0.01, float(expected[k])) for k in range(3)
     )
     assert diagnose(prediction, rows, []) == ()
-    first = diagnose(prediction, rows, [Findings("0.5", 0, cells)])[0]
+    first = diagnose(prediction, rows, [LinkMeans("0.5", 0, cells)])[0]
     assert first.cause == "sum-for-mean"
     assert "(the sum over agents)" in first.text
 

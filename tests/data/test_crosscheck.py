@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -86,20 +85,17 @@ def test_rare_outcomes_that_were_not_seen_are_reckoned_with():
 
 
 def simulated(scenario, link, runs, seed, of=lambda P: np.trace(P, axis1=-2, axis2=-1)):
-    """Honest results of one link probability."""
+    """Honest results of one link probability, as columns."""
     s = sf.predict(scenario, [link], method="monte-carlo", runs=runs, seed=seed, workers=1).sampled.sample
     P = of(s.values.P)[s.which]
     _, run, step, agent = (i.ravel() for i in np.indices(P.shape))
-    return read_results(
-        {"run": run, "agent": agent + 1, "step": step + 1, "link": np.full(P.size, link), "covariance": P.ravel()}
-    )
+    return {"run": run, "agent": agent + 1, "step": step + 1, "link": np.full(P.size, link), "covariance": P.ravel()}
 
 
-def part(results, first, last):
-    """Some of the runs."""
-    some = (results.run >= first) & (results.run < last)
-    columns = {name: getattr(results, name)[some] for name in ("link", "step", "agent", "covariance", "run", "line")}
-    return replace(results, **columns)
+def part(columns, first, last):
+    """Results of some of the runs."""
+    some = (columns["run"] >= first) & (columns["run"] < last)
+    return read_results({name: column[some] for name, column in columns.items()})
 
 
 @pytest.mark.parametrize(
@@ -121,14 +117,14 @@ def test_metrics_that_are_not_linear(name):
     """The mean of a metric over the outcomes is not the metric of the mean."""
     scenario = sf.load_scenario(steps=3)
     m = metric(name, scenario.model)
-    results = simulated(scenario, 0.5, 5000, 4, m.of)
+    results = read_results(simulated(scenario, 0.5, 5000, 4, m.of))
     assert check_results(results, sf.predict(scenario, [0.5], method="general"), m).agrees
 
 
 def test_rounded_files_of_any_spread_pass(tmp_path):
     scenario = sf.load_scenario(steps=3)
     prediction, m = sf.predict(scenario, [0.98], method="general"), metric("trace", scenario.model)
-    honest = simulated(scenario, 0.98, 5000, 5)
+    honest = read_results(simulated(scenario, 0.98, 5000, 5))
     for digits in (0, 1, 2):
         rows = zip(honest.run, honest.agent, honest.step, honest.observed[0].values, strict=True)
         text = "run,agent,step,link,covariance\n" + "".join(f"{r},{a},{k},0.98,{P:.{digits}f}\n" for r, a, k, P in rows)
