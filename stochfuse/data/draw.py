@@ -8,13 +8,12 @@
 The truth begins at the scenario's initial.x (or where its nominal path does), first estimates lie about it.  Sensors
 look when the scenario says that they do, about its nominal path; what they show is the true function of the true state.
 
-Random numbers are drawn in blocks of runs, each with a seed of its own, so that a run depends on the seed and its
-number alone.
+Every run has streams of random numbers of its own, so that it depends on the seed and its number alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -31,8 +30,6 @@ from stochfuse.kalman.kernel import at_step, factor
 from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.system import System
 
-BLOCK = 100
-"""Runs drawn from one seed."""
 ARRIVALS, NOISES, DETECTIONS = 0, 1, 2
 """What a stream of random numbers is for."""
 
@@ -68,33 +65,29 @@ def drawn_arrivals(system: System, links: LinkRows, missed: np.ndarray, seed: in
     runs, steps, _ = missed.shape
     by_step = [events(system.network, links, step) for step in range(1, 1 + (steps if links.varies else 1))]
     by_step = by_step if links.varies else by_step * steps
+    size = (1, system.agents)
+    of_runs = [draw_fates(stream, by_step, [[]] * steps, size)[0] for stream in _streams(seed, ARRIVALS, first, runs)]
     heard: list[np.ndarray] = []
     late: dict[tuple[int, int], list[Late]] = {}
-    for place, number, block in _blocks(seed, ARRIVALS, first, runs):
-        fates, _ = draw_fates(block, by_step, [[]] * steps, (BLOCK, system.agents))
-        for step, (drawn, now) in enumerate(zip(fates, by_step, strict=True)):
-            mine = drawn[number]
-            for event, fate in zip(now, mine.T, strict=True):
-                came = np.flatnonzero(fate == 1)
-                for receiver in event.receivers:
-                    rows = np.full((len(came), 4), (0, step, receiver, event.sender))
-                    rows[:, 0] = place.start + came
-                    heard.append(rows)
-                for run in np.flatnonzero((fate > 1) & (step + fate - 1 < steps)).tolist():
-                    messages = late.setdefault((place.start + run, step + 1), [])
-                    messages += [Late(receiver, int(fate[run]) - 1, event.sender) for receiver in event.receivers]
+    for step, now in enumerate(by_step):
+        fates = np.concatenate([fates[step] for fates in of_runs])
+        for event, fate in zip(now, fates.T, strict=True):
+            came = np.flatnonzero(fate == 1)
+            for receiver in event.receivers:
+                rows = np.full((len(came), 4), (0, step, receiver, event.sender))
+                rows[:, 0] = came
+                heard.append(rows)
+            for run in np.flatnonzero((fate > 1) & (step + fate - 1 < steps)).tolist():
+                messages = late.setdefault((run, step + 1), [])
+                messages += [Late(receiver, int(fate[run]) - 1, event.sender) for receiver in event.receivers]
     rows = np.concatenate(heard) if heard else np.zeros((0, 4), dtype=np.int64)
     return arrivals_of(rows, missed, {key: tuple(sorted(messages)) for key, messages in late.items()})
 
 
-def _blocks(seed: int, what: int, first: int, runs: int) -> list[tuple[slice, slice, np.random.Generator]]:
-    """For every block of runs that is met: places among these runs, places in the block, and its random numbers."""
-    out = []
-    for block in range(first // BLOCK, (first + runs - 1) // BLOCK + 1):
-        start, stop = max(first, block * BLOCK), min(first + runs, (block + 1) * BLOCK)
-        generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(what, block)))
-        out.append((slice(start - first, stop - first), slice(start - block * BLOCK, stop - block * BLOCK), generator))
-    return out
+def _streams(seed: int, what: int, first: int, runs: int) -> Iterator[np.random.Generator]:
+    """Random numbers of every run."""
+    for run in range(first, first + runs):
+        yield np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(what, run)))
 
 
 def drawn(
@@ -114,32 +107,24 @@ def drawn(
     runs, seed, first : how many runs, the seed of all, and the number of the first of these.
     """
     functions = tuple(functions) or (None,) * system.agents
-    missed = np.zeros((runs, system.steps, system.agents), dtype=bool)
-    for place, number, generator in _blocks(seed, DETECTIONS, first, runs):
-        steps = range(1, system.steps + 1)
-        size = (BLOCK, system.agents)
-        _, missing = draw_fates(generator, [[]] * system.steps, [system.detections(k) for k in steps], size)
-        missed[place] = np.stack(missing, axis=1)[number]
-    parts = []
-    for _, number, generator in _blocks(seed, NOISES, first, runs):
-        parts.append(_Block(system, functions, start, generator).drawn(number))
-    truth, z, relations, begun = zip(*parts, strict=True)
+    missed = _misses(system, runs, seed, first)
+    world = _Runs(system, functions, start, _streams(seed, NOISES, first, runs))
+    truth, z, relations, begun = world.drawn()
     if system.filters and not system.own:
-        _check_one_truth(np.concatenate(truth))
-    measured = tuple(np.concatenate(each) for each in zip(*z, strict=True))
-    for agent, each in enumerate(measured):
+        _check_one_truth(truth)
+    for agent, each in enumerate(z):
         each[missed[:, :, agent]] = np.nan
-        if (
-            functions[agent] is not None
-        ):  # whose matrices are those of the estimate, also where the nominal path has none
+        if functions[agent] is not None:  # its matrices are made where it measures, whatever the nominal path says
             missed[:, 1:, agent] = np.isnan(each[:, 1:, 0])
-    return Drawn(
-        np.concatenate(truth),
-        measured,
-        {pair: np.concatenate([each[pair] for each in relations]) for pair in system.relations},
-        missed,
-        tuple(np.concatenate(each) for each in zip(*begun, strict=True)),
-    )
+    return Drawn(truth, tuple(z), relations, missed, tuple(begun))
+
+
+def _misses(system: System, runs: int, seed: int, first: int) -> np.ndarray:
+    """Which sensors that look see nothing, (runs, steps, agents)."""
+    if system.detects is None:
+        return np.zeros((runs, system.steps, system.agents), dtype=bool)
+    p = system.detects[:, list(system.sensor_of)]
+    return np.stack([stream.random(p.shape) >= p for stream in _streams(seed, DETECTIONS, first, runs)])
 
 
 def _check_one_truth(truth: np.ndarray) -> None:
@@ -152,27 +137,33 @@ def _check_one_truth(truth: np.ndarray) -> None:
         )
 
 
-class _Block:
-    """Truth and measurements of a block of runs."""
+class _Runs:
+    """Truth and measurements of some runs, each with its own random numbers."""
 
     def __init__(
-        self, system: System, functions: Sequence[Function | None], start: np.ndarray, generator: np.random.Generator
+        self,
+        system: System,
+        functions: Sequence[Function | None],
+        start: np.ndarray,
+        streams: Iterator[np.random.Generator],
     ) -> None:
         still = [np.zeros((1, 1, 1)) for _ in range(system.agents)]
         readings = Readings.given(system, still, first=[start[None]] * system.agents)
-        self.system, self.functions, self.generator = system, functions, generator
+        self.system, self.functions = system, functions
         self.world: World = readings.world
-        self._roots: dict[bytes, np.ndarray] = {}
         self.start, self.inputs, self.shifts = readings.x0, readings.inputs, readings.shifts
+        D, p = len(self.world.P0), self.world.measurements[-1].stop
+        related = sum(at_step(relation.R, 1).shape[-1] for relation in self.world.relations.values())
+        total = D + system.steps * (D + p + related)
+        self._normal, self._used = np.stack([stream.standard_normal(total) for stream in streams]), 0
+        self._roots: dict[bytes, np.ndarray] = {}
 
-    def drawn(
-        self, which: slice
-    ) -> tuple[np.ndarray, list[np.ndarray], dict[tuple[int, int], np.ndarray], list[np.ndarray]]:
-        """Truth, measurements, relations and first estimates of some runs of the block."""
+    def drawn(self) -> tuple[np.ndarray, list[np.ndarray], dict[tuple[int, int], np.ndarray], list[np.ndarray]]:
+        """Truth, measurements, relations and first estimates."""
         world, steps = self.world, self.system.steps
-        x = np.broadcast_to(self.start, (BLOCK, *self.start.shape[1:]))
+        x = np.broadcast_to(self.start, (len(self._normal), *self.start.shape[1:]))
         error = self._noise(world.P0) + (0.0 if world.error is None else world.error)
-        begun = [self._state(i, x + error)[which] for i in range(world.agents)]
+        begun = [self._state(i, x + error) for i in range(world.agents)]
         truth, measured = [], []
         relations: dict[tuple[int, int], list[np.ndarray]] = {pair: [] for pair in world.relations}
         for step in range(1, steps + 1):
@@ -185,9 +176,8 @@ class _Block:
                 H_i, H_j, R = world.between(step, pair)
                 own, other = (x[:, world.states[i]] for i in pair)
                 relations[pair].append((H_i @ own + H_j @ other + self._noise(R))[..., 0])
-        z = [np.stack([now[i] for now in measured], axis=1)[which] for i in range(world.agents)]
-        related = {pair: np.stack(each, axis=1)[which] for pair, each in relations.items()}
-        return np.stack(truth, axis=1)[which], z, related, begun
+        z = [np.stack([now[i] for now in measured], axis=1) for i in range(world.agents)]
+        return np.stack(truth, axis=1), z, {pair: np.stack(e, axis=1) for pair, e in relations.items()}, begun
 
     def _measured(self, step: int, x: np.ndarray) -> list[np.ndarray]:
         """What every agent measures, NaN where its sensor does not look."""
@@ -205,8 +195,10 @@ class _Block:
         return own + self.shifts[agent] if M is None else M[agent] @ own + self.shifts[agent]
 
     def _noise(self, covariance: np.ndarray) -> np.ndarray:
-        """A draw for each run of the block, (runs, …, 1)."""
+        """A draw for each run, (runs, …, 1)."""
         key = covariance.tobytes()
         if key not in self._roots:  # most are the same at every step
             self._roots[key] = factor(covariance)
-        return self._roots[key] @ self.generator.standard_normal((BLOCK, len(covariance), 1))
+        unit = self._normal[:, self._used : self._used + len(covariance), None]
+        self._used += len(covariance)
+        return self._roots[key] @ unit
