@@ -39,9 +39,9 @@ EXAMPLES = (
     "stochfuse run my.toml --measurements z.csv --link 0.5 --estimator optimal",
 )
 EstimatorsOption = Annotated[
-    str,
+    str | None,
     option(
-        f"One or several: {', '.join(ESTIMATORS[:3])}, … (stochfuse methods); default: {LFG}.",
+        f"One or several: {', '.join(ESTIMATORS[:3])}, … (stochfuse methods); default: the scenario's, else {LFG}.",
         WORK,
         "--estimator",
         metavar="LIST",
@@ -83,7 +83,7 @@ def run(
     ] = None,
     changes: Changes = Changes(),
     seed: Annotated[int, option("Of arrivals that are drawn; default: 1.", NETWORK, min=0, metavar="N")] = 1,
-    estimator: EstimatorsOption = LFG,
+    estimator: EstimatorsOption = None,
     criterion: CriterionOption = "det",
     metric: MetricOption = None,
     covariance: Annotated[
@@ -107,7 +107,7 @@ def run(
 
     if measurements is None:
         raise UsageError("--measurements: expected a file of measurements, got none")
-    names = estimator_names(estimator)
+    names = None if estimator is None else estimator_names(estimator)
     files = [file for file in (measurements, arrivals, truth, initial) if file is not None]
     if [*files, scenario].count("-") > 1:
         raise UsageError("expected at most one file on standard input, got - for several")
@@ -117,7 +117,7 @@ def run(
     first = initial or beside(measurements)
     records = read_records(given, measurements, arrivals, truth, first, pairs("--columns", columns))
     chosen = metric_of(metric or given.metric or "trace", given.model)
-    way = Way(names, one_link(links), seed, criterion)
+    way = Way(names or (given.estimator or LFG,), one_link(links), seed, criterion)
     writing: Any = nullcontext()
     if output is not None:
         writing = EstimatesFile(output, records.scenario, truth=truth is not None, covariance=covariance)

@@ -36,7 +36,7 @@ def simulate(
     changes: Changes = Changes(),
     runs: Annotated[int, option("Independent runs; default: 1.", WORK, min=1, metavar="N")] = 1,
     seed: Annotated[int, option("Of all random numbers; default: 1.", WORK, min=0, metavar="N")] = 1,
-    estimator: EstimatorsOption = LFG,
+    estimator: EstimatorsOption = None,
     criterion: CriterionOption = "det",
     metric: MetricOption = None,
     format: FormatOption = None,
@@ -58,12 +58,17 @@ def simulate(
     """
     from stochfuse.data.simulate import simulate as simulated
 
-    names = estimator_names(estimator)
+    names = None if estimator is None else estimator_names(estimator)
     if output is not None and output.exists() and not output.is_dir():
         raise UsageError(f"--output: expected a folder, got the file {output}")
     check_files(None, plot, scenario)
     given, links = changes.of(scenario)
-    way = {"estimator": names, "link": one_link(links), "seed": seed, "criterion": criterion}
+    way = {
+        "estimator": names or (given.estimator or LFG,),
+        "link": one_link(links),
+        "seed": seed,
+        "criterion": criterion,
+    }
     found = simulated(given, runs, metric=metric, folder=output, force=force, **way)
     show(found, format, plot, digits)
     if output is not None:

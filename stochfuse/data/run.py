@@ -199,8 +199,10 @@ class Way:
     predicted: bool = True
 
 
-def way_of(given: Mapping[str, Any]) -> Way:
+def way_of(given: Mapping[str, Any], scenario: Scenario) -> Way:
     """Return how records are run, of what a caller gives: `estimator`, a name or several, and fields of `Way`.
+
+    Without an estimator it is the scenario's, else the Local Fusion Graph.
 
     Raises
     ------
@@ -211,7 +213,7 @@ def way_of(given: Mapping[str, Any]) -> Way:
     for name in given:
         if name not in known:
             raise UsageError(f"{name}: no such setting{nearest(name, known)}; expected {', '.join(known)}")
-    rest, asked = dict(given), given.get("estimator", (registry.LFG,))
+    rest, asked = dict(given), given.get("estimator") or scenario.estimator or registry.LFG
     rest.pop("estimator", None)
     names = (asked,) if isinstance(asked, str) else tuple(asked)
     for name in names:
@@ -242,7 +244,8 @@ def run(
         arrivals that are not given are drawn from the links.
     columns : names that they have for columns, by the names here.
     metric : what errors are shown in; default: the scenario's, else trace.
-    **way : estimator (a name or several), link, seed, criterion, predicted (False: predict nothing), see `Way`.
+    **way : estimator (a name or several; default: the scenario's, else local-fusion-graph), link, seed, criterion,
+        predicted (False: predict nothing), see `Way`.
 
     Returns
     -------
@@ -263,7 +266,7 @@ def run(
     >>> found.rows[0].estimator, found.rows[0].agent, found.rows[0].realised
     ('naive', None, None)
     """
-    how = way_of(way)
+    how = way_of(way, scenario)
     records = read_records(scenario, measurements, arrivals, truth, initial, columns)
     return run_records(records, metric_of(metric or scenario.metric or "trace", scenario.model), how)
 
