@@ -14,7 +14,7 @@ angles wrapped, as if this had been measured linearly.  Whoever uses the measure
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -216,11 +216,14 @@ class _Pairs:
 
     def unknown(self, keys: np.ndarray) -> np.ndarray:
         """Those of some keys that are not here, each once."""
-        keys = np.unique(keys)
+        return np.unique(keys[~self.known(keys)])
+
+    def known(self, keys: np.ndarray) -> np.ndarray:
+        """Which of some keys are here."""
         if not len(self.keys):
-            return keys
+            return np.zeros(len(keys), dtype=bool)
         at = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
-        return keys[self.keys[at] != keys]
+        return self.keys[at] == keys
 
     def add(self, keys: np.ndarray, block: int) -> None:
         """Add sorted keys, whose numbers are the rows of a block."""
@@ -247,12 +250,14 @@ class _Pairs:
         return out
 
 
-def _closed(unknown: np.ndarray, rests_on: Any, pairs: _Pairs) -> np.ndarray:
+def _closed(unknown: np.ndarray, rests_on: Callable[[np.ndarray], np.ndarray], pairs: _Pairs) -> np.ndarray:
     """Unknown keys with all unknown ones that they rest on."""
     found = unknown
     while len(unknown):
-        unknown = np.setdiff1d(pairs.unknown(rests_on(unknown)), found, assume_unique=True)
-        found = np.union1d(found, unknown)
+        unknown = pairs.unknown(rests_on(unknown))
+        if len(unknown):
+            unknown = np.setdiff1d(unknown, found, assume_unique=True)
+            found = np.union1d(found, unknown)
     return found
 
 
@@ -380,7 +385,8 @@ class SumNumbers:
     def keep(self, values: np.ndarray, runs: np.ndarray) -> None:
         """Keep their rows, and those of what was brought forward into them: later sums take the same atoms."""
         keys = np.unique(self.pairs.key(values, runs))
-        keys = np.union1d(keys, np.intersect1d(self._resting(keys), self.pairs.keys))
+        before = self._resting(keys)
+        keys = np.unique(np.concatenate([keys, before[self.pairs.known(before)]]))
         packed, self.pairs = self._gathered(keys), _Pairs(self.pairs.runs)
         self.pairs.add(keys, 0)
         self._packed = packed
@@ -406,8 +412,8 @@ class SumNumbers:
             for value in used.tolist()
         ]
         before, owner = _spread(rests_on, which)
-        before = before * self.pairs.runs + runs[owner]
-        return np.setdiff1d(before, keys)  # what is given rests on itself
+        given = before == values[owner]  # rests on itself
+        return (before * self.pairs.runs + runs[owner])[~given]
 
     def _sums(self, keys: np.ndarray, step: int) -> np.ndarray:
         values, runs = np.divmod(keys, self.pairs.runs)
