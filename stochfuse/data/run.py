@@ -221,6 +221,14 @@ def way_of(given: Mapping[str, Any]) -> Way:
     return Way(names, **rest)
 
 
+def _check_criterion(criterion: str) -> None:
+    if criterion not in registry.CRITERIA:
+        raise UsageError(
+            f"criterion: expected one of {', '.join(registry.CRITERIA)}, got '{criterion}'"
+            f"{nearest(criterion, registry.CRITERIA)}"
+        )
+
+
 @of_scenario
 def run(
     scenario: Scenario,
@@ -287,6 +295,7 @@ def run_records(
     NoAnswerError
         If an estimator claims no covariance in some run.
     """
+    _check_criterion(way.criterion)
     scenario = records.scenario
     links = None
     if not records.given or way.link is not None or scenario.network.link is not None or scenario.network.cases:
@@ -296,7 +305,7 @@ def run_records(
             "arrivals are drawn from the scenario's links: expected one link probability; give --link or --arrivals"
         )
     tallies = {name: Tally(records, name, way.criterion) for name in way.estimators}
-    done, total = 0, len(records.names) * len(way.estimators)
+    done, total = 0, len(records.names) * len(way.estimators) * scenario.network.steps
     heard = None
     for batch in records.batches():
         arrivals = batch.arrivals
@@ -304,9 +313,8 @@ def run_records(
             arrivals = drawn_arrivals(scenario.system, links, batch.missed, way.seed, int(batch.runs[0]))  # type: ignore[arg-type]
         heard = _heard(arrivals) if heard is None else heard
         for tally in tallies.values():
-            tally.add(batch, arrivals, write)
-            done += len(batch.runs)
-            listener().advance("running estimators", done, total)
+            tally.add(batch, arrivals, write, (done, total))
+            done += len(batch.runs) * scenario.network.steps
     rows, notes = [], list(records.notes)
     for tally in tallies.values():
         expected = _expected(scenario, links, tally.estimator, way) if way.predicted else Expected(None, "", ())
@@ -376,8 +384,14 @@ class Tally:
         self._given, self._given_count = np.zeros((steps, n, d, d)), 0
         self._shown: list[np.ndarray] = []
 
-    def add(self, batch: Batch, arrivals: Arrivals, write: Callable[[Estimates], None] | None) -> None:
-        """Run a batch."""
+    def add(
+        self,
+        batch: Batch,
+        arrivals: Arrivals,
+        write: Callable[[Estimates], None] | None = None,
+        work: tuple[int, int] = (0, 1),
+    ) -> None:
+        """Run a batch; `work`: steps of runs that were gone through before, and all."""
         system, known = self.records.scenario.system, self.records.known
         shape = (len(batch.runs), system.steps, system.agents)
         nees, nis = np.full(shape, np.nan), np.full(shape, np.nan)
@@ -385,6 +399,7 @@ class Tally:
         first = not self._shown
         for stage in stages(self.records, batch, arrivals, self.estimator, self.criterion):
             k = stage.step - 1
+            listener().advance("running estimators", work[0] + stage.step * len(batch.runs), work[1])
             x = np.stack([estimate.x[..., 0] for estimate in stage.estimates], axis=1)
             P = np.stack([estimate.P for estimate in stage.estimates], axis=1)
             nis[:, k] = stage.nis
