@@ -23,6 +23,7 @@ import numpy as np
 from stochfuse.data.consistency import Average, Series, band
 from stochfuse.data.draw import drawn_arrivals
 from stochfuse.data.records import Batch, read_records
+from stochfuse.data.suspicions import Suspicion, suspicions
 from stochfuse.engines.progress import listener
 from stochfuse.engines.replay import Arrivals, Stage, moments_given, replay
 from stochfuse.errors import StochfuseError, UsageError, nearest
@@ -147,6 +148,8 @@ class RunResult(Result):
     traces : each estimator over the steps.
     heard : (steps, agents, agents) what arrived in the first run at once, receiver × sender, itself not counted.
     notes : what the reader should know.
+    suspicions : what may be wrong with the record, or with the scenario, where innovations are far from consistent; the
+        one that explains most first.
     """
 
     scenario: Scenario
@@ -158,6 +161,7 @@ class RunResult(Result):
     heard: np.ndarray
     notes: tuple[str, ...] = ()
     simulated: bool = False
+    suspicions: tuple[Suspicion, ...] = ()
 
 
 class Estimates(NamedTuple):
@@ -190,6 +194,7 @@ class Way:
     seed : of drawn arrivals.
     criterion : what the weights of an intersection minimise.
     predicted : whether errors are predicted too.
+    suspected : whether faults are looked for where innovations are far from what is claimed.
     """
 
     estimators: tuple[str, ...] = (registry.LFG,)
@@ -197,6 +202,7 @@ class Way:
     seed: int = 1
     criterion: str = "det"
     predicted: bool = True
+    suspected: bool = True
 
 
 def way_of(given: Mapping[str, Any]) -> Way:
@@ -250,7 +256,9 @@ def run(
         arrivals that are not given are drawn from the links.
     columns : names that they have for columns, by the names here.
     metric : what errors are shown in; default: the scenario's, else trace.
-    **way : estimator (a name or several), link, seed, criterion, predicted (False: predict nothing), see `Way`.
+    **way : estimator (a name or several), link, seed, criterion, predicted (False: predict nothing), suspected (False:
+        look for no faults), see
+        `Way`.
 
     Returns
     -------
@@ -306,12 +314,14 @@ def run_records(
         )
     tallies = {name: Tally(records, name, way.criterion) for name in way.estimators}
     done, total = 0, len(records.names) * len(way.estimators) * scenario.network.steps
-    heard = None
+    heard, suspected = None, ()
     for batch in records.batches():
         arrivals = batch.arrivals
         if arrivals is None:
             arrivals = drawn_arrivals(scenario.system, links, batch.missed, way.seed, int(batch.runs[0]))  # type: ignore[arg-type]
-        heard = _heard(arrivals) if heard is None else heard
+        if heard is None:
+            heard = _heard(arrivals)
+            suspected = suspicions(scenario, batch, records.known) if way.suspected else ()
         for tally in tallies.values():
             tally.add(batch, arrivals, write, (done, total))
             done += len(batch.runs) * scenario.network.steps
@@ -331,6 +341,7 @@ def run_records(
         tuple(tally.trace() for tally in tallies.values()),
         heard,
         tuple(dict.fromkeys(notes)),
+        suspicions=suspected,
     )
 
 
