@@ -42,6 +42,8 @@ NEAR, LOW = 0.2, 0.15
 """Least departure that is looked at: of a mean square from 1, of a mean or autocorrelation from 0."""
 AGENTS = 6
 """Agents suspected one by one: those that are farthest off."""
+SWALLOW = ("R-scaled", "Q-scaled", "P-scaled")
+"""What explains anything to some degree."""
 ROUNDS = 3
 """Suspicions told of a record at most."""
 HANGING, FAR, VERY_FAR = 3.0, 1.5, 5.0
@@ -135,24 +137,42 @@ def suspicions(scenario: Scenario, batch: Batch, known: np.ndarray) -> tuple[Sus
     )
     setting = setting_of(system, functions, [x[:runs] for x in batch.first])
     ones = tuple(np.ones(each.shape[-1]) for each in z)
-    case, found = Case(z, ones, ones), []
-    now = innovations(setting, [case])
+    trial = _Trial(scenario, setting, Case(z, ones, ones))
+    if _wrong(trial.now):
+        return _explained(trial)
+    if batch.truth is not None:
+        return tuple(_of_truth(trial, batch.truth[:runs, :steps], known))
+    return ()
+
+
+def _explained(trial: _Trial) -> tuple[Suspicion, ...]:
+    """What explains it, one after the other; a noise that swallows everything only alone, and if nothing else does."""
+    found, value = _path(trial, ())
+    if any(each.suspicion in SWALLOW for each in found):
+        other, other_value = _path(trial, SWALLOW)
+        found = other if other_value > value or len(found) > 1 else found
+    return tuple(found) or (_unknown(trial),)
+
+
+def _path(trial: _Trial, without: Sequence[str]) -> tuple[list[Suspicion], float]:
+    """Suspicions, each the likeliest after those before, and the likelihood in the end; none if that is not right."""
+    found, cost = [], 0.0
     for _ in range(ROUNDS):
-        if not _wrong(now):
+        if not _wrong(trial.now):
             break
-        best = _best(_Trial(scenario, setting, case, now))
+        best = _best(trial, without=without)
         if best is None:
             break
         tried, after = best
+        now = trial.now
         explains = not _wrong(after) or abs(after.nis() - 1.0) <= NEAR
         how = _how("NIS", now.nis(), after.nis(), explains=explains)
         found.append(Suspicion(tried.name, tried.agent, tried.text + how, explains))
-        case, now = tried.case, after
-    if _wrong(now):
-        return tuple(found) or (_unknown(now),)
-    if batch.truth is not None:
-        found += _of_truth(_Trial(scenario, setting, case, now), batch.truth[:runs, :steps], known)
-    return tuple(found)
+        cost += 0.5 * tried.fitted * np.log(now.counts[0])
+        trial = trial.of(tried.case, after)
+    if not found or not found[-1].explains:
+        return [], -np.inf
+    return found, float(trial.now.likelihood[0]) - cost
 
 
 def _part(batch: Batch, system: System) -> tuple[int, int]:
@@ -171,15 +191,18 @@ def _measured(system: System, batch: Batch, agent: int, f: object) -> np.ndarray
     return there & looked
 
 
-def _unknown(now: Innovations) -> Suspicion:
-    each = [now.nis(0, agent) for agent in range(now.white.shape[3])]
-    off = [abs(np.log(value)) if value > 0 else 0.0 for value in each]
-    agent = int(np.argmax(off))
-    text = (
-        f"innovations are not what the scenario says (NIS {now.nis():.3g} where 1 is expected), and nothing tried "
-        f"explains it; the worst is agent {agent + 1} (NIS {now.nis(0, agent):.3g})"
-    )
-    return Suspicion("unknown", agent + 1, text, explains=False)
+def _unknown(trial: _Trial) -> Suspicion:
+    """Nothing explains it; the worst is the agent without which the others agree best."""
+    setting, case, now = trial.setting, trial.case, trial.now
+    said = f"nothing tried explains the innovations (NIS {now.nis():.3g}, expected 1)"
+    seeing = [i for i, z in enumerate(case.z) if not np.isnan(z).all()]
+    if len(seeing) == 1:
+        return Suspicion("unknown", None, said, explains=False)
+    without = innovations(setting, [case.with_agent(i, z=np.full_like(case.z[i], np.nan)) for i in seeing])
+    off = [abs(np.log(max(without.nis(place), 1e-300))) for place in range(len(seeing))]
+    place = int(np.argmin(np.where(np.isnan(off), np.inf, off)))
+    text = f"{said}; the worst is agent {seeing[place] + 1} (NIS {without.nis(place):.3g} without it)"
+    return Suspicion("unknown", seeing[place] + 1, text, explains=False)
 
 
 def _wrong(now: Innovations, case: int = 0) -> bool:
@@ -208,8 +231,8 @@ def _wrong(now: Innovations, case: int = 0) -> bool:
     return False
 
 
-def _best(trial: _Trial, *, alone: bool = False) -> tuple[Tried, Innovations] | None:
-    """What explains most, if anything does; of one agent only."""
+def _best(trial: _Trial, *, alone: bool = False, without: Sequence[str] = ()) -> tuple[Tried, Innovations] | None:
+    """What explains most, if anything does; of one agent only; without those of some names."""
     tried = list(trial.cases())
     first = innovations(trial.setting, [trial.case, *(each.case for each in tried)])
     more = list(trial.fitted(tried, first))
@@ -219,7 +242,7 @@ def _best(trial: _Trial, *, alone: bool = False) -> tuple[Tried, Innovations] | 
     base = trial.now.likelihood[0]
     best, most = None, 2.0 * MARGIN
     for each, found, i in both:
-        if not each.name or (alone and each.agent is None):
+        if not each.name or each.name in without or (alone and each.agent is None):
             continue
         value = found.likelihood[i]
         gain = np.inf if not np.isfinite(base) and np.isfinite(value) else 2.0 * (value - base)
@@ -238,15 +261,15 @@ def _of_truth(trial: _Trial, truth: np.ndarray, known: np.ndarray) -> list[Suspi
     far = now is not None and now.far
     if now is None or not (far or (about is not None and _wrong(about.now))):
         return []
+    if about is not None and _wrong(about.now):
+        return _about_truth(trial, about, truth)
     best = _best(trial)
-    if best is not None and far:
+    if best is not None:
         tried, _ = best
         after = _errors(trial.setting, tried.case, truth, known)
         if after is not None and after.mean < now.mean:
             how = _how("NEES", now.mean, after.mean, explains=not after.far)
             return [Suspicion(tried.name, tried.agent, tried.text + how, not after.far)]
-    if about is not None and _wrong(about.now):
-        return _about_truth(trial, about, truth)
     found = [
         (name, said, _errors(trial.setting, trial.case, other, known))
         for name, said, other in _truths(truth)
@@ -340,7 +363,8 @@ def _errors(setting: Setting, case: Case, truth: np.ndarray, known: np.ndarray) 
 class _Trial:
     """Everything that is suspected of a case."""
 
-    def __init__(self, scenario: Scenario, setting: Setting, case: Case, now: Innovations) -> None:
+    def __init__(self, scenario: Scenario, setting: Setting, case: Case, now: Innovations | None = None) -> None:
+        now = innovations(setting, [case]) if now is None else now
         self.scenario, self.setting, self.case, self.now = scenario, setting, case, now
         self.units = [_units(scenario, i) for i in range(len(case.z))]
         self.names = scenario.network.names
@@ -353,7 +377,11 @@ class _Trial:
     def about(self, truth: np.ndarray) -> _Trial:
         """Return the same of deviations from what the true states would show."""
         setting = self.setting._replace(truth=truth)
-        return _Trial(self.scenario, setting, self.case, innovations(setting, [self.case]))
+        return _Trial(self.scenario, setting, self.case)
+
+    def of(self, case: Case, now: Innovations) -> _Trial:
+        """Return the same of another case, whose innovations are known."""
+        return _Trial(self.scenario, self.setting, case, now)
 
     def cases(self) -> Iterator[Tried]:
         """Those without anything to fit, and those that others are fitted by, which have no name."""
