@@ -136,6 +136,8 @@ def show(found: RunResult, format: str | None, plot: Path | None, digits: int) -
     report = run_report(found, digits)
     for note in found.notes:
         typer.echo(f"note: {note}", err=True)
+    for suspicion in found.suspicions:
+        typer.echo(f"note: {suspicion.text}", err=True)
     if plot is not None and report.draw is not None:
         save(report.draw, plot)
     write_report(report, chosen_format(format, None), None)

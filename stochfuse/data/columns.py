@@ -39,6 +39,8 @@ from stochfuse.data.tables import (
 )
 from stochfuse.errors import nearest
 
+EXACT = 2.0**53
+"""Largest whole number up to which all are told apart."""
 SAMPLE = 10_000
 """Cells whose texts are kept, to see with how many digits they are given."""
 
@@ -74,6 +76,8 @@ class Field(NamedTuple):
 
 Fields = Sequence[Field] | Callable[[Sequence[str]], Sequence[Field]]
 """What is wanted; or what says so once the names of the columns are known."""
+Renamed = Mapping[str, str] | Callable[[Sequence[str]], Mapping[str, str]]
+"""The table's names for columns by the fields'; or what says so once they are known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +153,12 @@ class Columns:
 
 
 def read_columns(
-    source: Any, fields: Fields, renamed: Mapping[str, str] | None = None, *, others: bool = True
+    source: Any,
+    fields: Fields,
+    renamed: Renamed | None = None,
+    *,
+    others: bool = True,
+    empty: bool = False,
 ) -> Columns:
     """Read a table.
 
@@ -159,13 +168,15 @@ def read_columns(
         (anything with `columns` that gives an array by name).  JSON is a list of records, or an object with one list
         per column; either may be in an object as "results".
     fields : what is wanted, or a function that makes it of the names of the columns.
-    renamed : names that the table has for columns, by the names of the fields.
+    renamed : names that the table has for columns, by the names of the fields; or a function that says which of the
+        names of the columns.
     others : whether other columns may be there.
+    empty : whether there may be no rows under the headings.
 
     Returns
     -------
     Columns
-        At least one row.
+        At least one row, unless `empty`.
 
     Raises
     ------
@@ -181,7 +192,7 @@ def read_columns(
     >>> found.number["step"], found.number["z1"]
     (array([1, 2]), array([0.5, nan]))
     """
-    return _joined(list(_parts(source, fields, renamed or {}, others)))
+    return _joined(list(_parts(source, fields, renamed or {}, others, empty)))
 
 
 def read_chunks(
@@ -201,12 +212,12 @@ def read_chunks(
             yield part.part(start, start + rows)
 
 
-def _parts(source: Any, fields: Fields, renamed: Mapping[str, str], others: bool) -> Iterator[Columns]:
+def _parts(source: Any, fields: Fields, renamed: Renamed, others: bool, empty: bool = False) -> Iterator[Columns]:
     with ExitStack() as stack:
-        yield from _parts_of(opened(source, stack), fields, renamed, others)
+        yield from _parts_of(opened(source, stack), fields, renamed, others, empty)
 
 
-def _parts_of(table: OpenedTable, fields: Fields, renamed: Mapping[str, str], others: bool) -> Iterator[Columns]:
+def _parts_of(table: OpenedTable, fields: Fields, renamed: Renamed, others: bool, empty: bool) -> Iterator[Columns]:
     places, wanted, skipped = _matched(table, fields, renamed, others)
     known: dict[str, dict[str, int]] = {field.name: {} for field in wanted}
     kinds = {place: field.kind for place, field in zip(places, wanted, strict=True)}
@@ -226,9 +237,19 @@ def _parts_of(table: OpenedTable, fields: Fields, renamed: Mapping[str, str], ot
                     written[field.name] = _written(raw, place)
         rows += raw.length
         yield checked
-    if not rows:
+    if not rows and empty:
+        yield _nothing(table, wanted, skipped)
+    elif not rows:
         under = f" under the headings {', '.join(table.header)}" if table.header else ""
         raise ColumnsError(f"{table.name}: no rows{under}; expected columns {_names(wanted)}")
+
+
+def _nothing(table: OpenedTable, wanted: Sequence[Field], skipped: tuple[str, ...]) -> Columns:
+    """No rows, but with headings."""
+    number = {field.name: np.zeros(0) for field in wanted if field.kind != TEXT}
+    text = {field.name: Labels(np.zeros(0, dtype=np.int32), ()) for field in wanted if field.kind == TEXT}
+    none = np.zeros(0, dtype=np.int64)
+    return Columns(table.name, 0, number, text, {}, {}, skipped, table.what, none, none)
 
 
 def _written(raw: Raw, place: int) -> tuple[str, ...]:
@@ -241,7 +262,7 @@ def _names(wanted: Sequence[Field]) -> str:
 
 
 def _matched(
-    table: OpenedTable, fields: Fields, renamed: Mapping[str, str], others: bool
+    table: OpenedTable, fields: Fields, renamed: Renamed, others: bool
 ) -> tuple[list[int], list[Field], tuple[str, ...]]:
     """Places and fields of the columns that are wanted and there, and the names of the others."""
     header = list(table.header)
@@ -252,6 +273,7 @@ def _matched(
     if len(set(header)) < len(header):
         raise ColumnsError(f"{table.name}: a column is named twice: {', '.join(header)}")
     names: list[str | None] = list(header)
+    renamed = renamed(header) if callable(renamed) else renamed
     for ours, theirs in renamed.items():
         place = _place(theirs, header)
         if place is None:
@@ -320,7 +342,7 @@ def _checked(
         values, empty, wrong = found if isinstance(found, NumberColumn) else _numbers(found)
         bad = np.zeros(len(values), dtype=bool) if field.free else ~np.isfinite(values) | (values < field.least)
         if field.kind == WHOLE:
-            bad |= values != np.round(values)
+            bad |= (values != np.round(values)) | (np.abs(values) > EXACT)
         bad[empty] = not field.blank
         bad |= wrong
         if bad.any():

@@ -18,7 +18,6 @@ runs at a time.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -35,6 +34,10 @@ ALONE = ("1",)
 """Names of the runs where no file has any."""
 NUMBERS = 400_000
 """Agents times steps of a batch of runs."""
+LARGEST = 1e100
+"""Size of a number from which on its square tells nothing."""
+MANY, SPARSE = 2_000, 200
+"""Steps from which on a step must be spoken of in so many at least, lest times be taken for numbers of steps."""
 
 
 class RunRows(NamedTuple):
@@ -275,6 +278,7 @@ def read_records(
     given = {name: table for name, table in tables.items() if table is not None}
     names = _runs(given)
     last = max(table.last for table in given.values())
+    _check_steps(last, given)
     scenario = _lengthened(scenario, last, given)
     rows = {name: table.rows(names) for name, table in given.items()}
     measured = rows["measurements"]
@@ -297,6 +301,19 @@ def _taken(rows: RunRows, which: np.ndarray) -> RunRows:
     return RunRows(None if rows.run is None else rows.run[which], rows.where[which], rows.values[which])
 
 
+def _check_steps(last: int, tables: Mapping[str, _Given]) -> None:
+    """Raise UsageError if hardly any of the steps are spoken of: these are times, or one of them is a slip."""
+    different = len(np.unique(np.concatenate([table.where[:, 0] for table in tables.values()])))
+    if last <= MANY or last <= SPARSE * different:
+        return
+    table = max(tables.values(), key=lambda table: table.last)
+    row = int(table.where[:, 0].argmax())
+    raise ColumnsError(
+        f"{table.columns.at(table.row(row), 'step')}: expected steps 1, 2, … one by one, got step {last} where the "
+        f"files speak of {different} steps; are these times?"
+    )
+
+
 def _lengthened(scenario: Scenario, last: int, tables: Mapping[str, _Given]) -> Scenario:
     """The scenario with as many steps as the records have."""
     steps = scenario.network.steps
@@ -309,7 +326,7 @@ def _lengthened(scenario: Scenario, last: int, tables: Mapping[str, _Given]) -> 
         longer = load_scenario({**source, "network": {**source["network"], "steps": last}})
     except StochfuseError as error:
         table = max(tables.values(), key=lambda table: table.last)
-        row = int(table.where[:, 0].argmax())
+        row = table.row(int(table.where[:, 0].argmax()))
         raise ColumnsError(
             f"{table.columns.at(row, 'step')}: expected at most the scenario's {steps} steps, got {last}; it cannot be "
             f"lengthened: {error}"
@@ -348,6 +365,11 @@ class _Given(NamedTuple):
     where: np.ndarray
     values: np.ndarray
     notes: tuple[str, ...]
+    kept: np.ndarray
+
+    def row(self, place: int) -> int:
+        """Row of the file that one of these is."""
+        return int(self.kept[place])
 
     @property
     def last(self) -> int:
@@ -359,7 +381,7 @@ class _Given(NamedTuple):
         if self.run is None:
             return RunRows(None, self.where, self.values)
         place = {name: i for i, name in enumerate(names)}
-        run = np.array([place[name] for name in self.run.names])[self.run.codes]
+        run = np.array([place[name] for name in self.run.names], dtype=np.int64)[self.run.codes]
         order = np.argsort(run, kind="stable")
         return RunRows(run[order], self.where[order], self.values[order])
 
@@ -370,11 +392,12 @@ class _Reader:
     def __init__(self, scenario: Scenario, renamed: dict[str, str]) -> None:
         self.scenario, self.renamed = scenario, renamed
         self.used: set[str] = set()
+        self.seen: dict[str, None] = {}
         self.known = np.arange(scenario.model.dimension)
         network = scenario.network
         self.agents = {str(i + 1): i for i in range(network.agents)} | {name: i for i, name in enumerate(network.names)}
 
-    def columns(self, source: Any, fields: Callable[[Sequence[str]], list[Field]]) -> Columns:
+    def columns(self, source: Any, fields: Callable[[Sequence[str]], list[Field]], empty: bool = False) -> Columns:
         """Columns of a file, those that have other names there among them."""
 
         def asked(names: Sequence[str]) -> list[Field]:
@@ -382,27 +405,26 @@ class _Reader:
             self.used |= {field.name for field in found}
             return found
 
-        return read_columns(source, asked, self._renamed_in(source, fields) if self.renamed else {})
+        return read_columns(source, asked, lambda names: self._renamed_in(names, fields), empty=empty)
 
-    def _renamed_in(self, source: Any, fields: Callable[[Sequence[str]], list[Field]]) -> dict[str, str]:
-        """Those of the given names that this file has, of columns that are wanted of it."""
-        seen: list[str] = []
-
-        def look(names: Sequence[str]) -> list[Field]:
-            seen.extend(names)
-            return []
-
-        with suppress(ColumnsError):
-            read_columns(source, look)
-        here = {ours: theirs for ours, theirs in self.renamed.items() if theirs in seen}
-        wanted = {field.name for field in fields([*here, *seen])}
+    def _renamed_in(self, names: Sequence[str], fields: Callable[[Sequence[str]], list[Field]]) -> dict[str, str]:
+        """Those of the given names that a file has, of columns that are wanted of it."""
+        self.seen.update(dict.fromkeys(names))
+        here = {ours: theirs for ours, theirs in self.renamed.items() if theirs in names}
+        if not here:
+            return {}
+        wanted = {field.name for field in fields([*here, *names])}
         return {ours: theirs for ours, theirs in here.items() if ours in wanted}
 
     def check_columns(self) -> None:
         """Raise UsageError if a name was given for a column that no file has."""
-        for ours in self.renamed:
+        for ours, theirs in self.renamed.items():
             if ours not in self.used:
                 raise UsageError(f"columns: unknown column '{ours}'{nearest(ours, sorted(self.used))}")
+            if theirs not in self.seen:
+                raise UsageError(
+                    f"columns: no file has a column '{theirs}'{nearest(theirs, self.seen)}, to be used as '{ours}'"
+                )
 
     def measurements(self, source: Any) -> _Given:
         """Measurements, and those of other agents: keys step, agent, agent that was measured or −1."""
@@ -422,7 +444,7 @@ class _Reader:
             of = self._agent(found, "of", blank=True)
         z = [f"z{i}" for i in range(1, most + 1) if f"z{i}" in found]
         values = np.stack([found.number[name] for name in z], axis=1)
-        self._check_infinite(found, values, z)
+        self._check_size(found, values, z, "a finite number or nothing")
         expected = np.array([widths[i] for i in agent])
         for row in np.flatnonzero(of >= 0).tolist():
             relation = self.scenario.relations.get((int(agent[row]), int(of[row])))
@@ -444,6 +466,10 @@ class _Reader:
         notes = []
         if early:
             notes.append(f"{found.source}: {early} measurements of step 1 are not used: estimates begin there")
+        unused = [name for name in found.skipped if name[:1].lower() == "z" and name[1:].isdigit()]
+        if unused:
+            listed = ", ".join(unused[:3]) + (", …" if len(unused) > 3 else "")
+            notes.append(f"{found.source}: not used is {listed}: sensors of the scenario measure at most {most}")
         if values.shape[1] < most:
             values = np.concatenate([values, np.full((len(values), most - values.shape[1]), np.nan)], axis=1)
         return self._once(found, where, values, notes, step > 0)
@@ -467,13 +493,14 @@ class _Reader:
                 Field("sent_step", WHOLE, 1, required=False, blank=True),
             ]
 
-        found = self.columns(source, fields)
+        found = self.columns(source, fields, empty=True)
         receiver, sender = self._agent(found, "receiver"), self._agent(found, "sender")
         notes, there = [], np.ones(len(found), dtype=bool)
         if "seq" in found:
             seq = found.number["seq"].astype(np.int64)
-            step = seq - min(int(seq.min()), 1)
-            notes.append(f"{found.source}: a packet log; packet {min(int(seq.min()), 1)} is taken for step 1's")
+            begins = int(seq.min(initial=1))
+            step = seq - begins
+            notes.append(f"{found.source}: a packet log; packet {begins} is taken for step 1's")
             there = found.number["received"] != 0 if "received" in found else there
             sent = step
         else:
@@ -493,7 +520,14 @@ class _Reader:
         if (again & there).any():
             notes.append(f"{found.source}: {int((again & there).sum())} messages came again; the first time counts")
         kept = there & ~again
-        return _Given(found, self._run(found, kept), where[kept], np.zeros((int(kept.sum()), 0)), tuple(notes))
+        return _Given(
+            found,
+            self._run(found, kept),
+            where[kept],
+            np.zeros((int(kept.sum()), 0)),
+            tuple(notes),
+            np.flatnonzero(kept),
+        )
 
     def truth(self, source: Any) -> _Given:
         """True states: keys step, agent or −1 for all."""
@@ -519,6 +553,7 @@ class _Reader:
         self.known = np.array([states.index(state) for state in shown])
         agent = self._agent(found, "agent") if "agent" in found else np.full(len(found), -1)
         values = np.stack([found.number[state] for state in shown], axis=1)
+        self._check_size(found, values, shown, "a number or nothing")
         step = found.number["step"].astype(np.int64) - 1
         notes = []
         if len(shown) < len(states):
@@ -533,9 +568,16 @@ class _Reader:
         found = self.columns(source, lambda _: given)
         agent = self._agent(found, "agent")
         values = np.stack([found.number[state] for state in states], axis=1)
-        for i in range(self.scenario.network.agents):
-            if not (agent == i).any():
-                raise UsageError(f"{found.source}: expected a first estimate of every agent, got none of agent {i + 1}")
+        self._check_size(found, values, states, "a number")
+        runs, names = found.text["run"] if "run" in found else (np.zeros(len(found), dtype=np.int64), ("",))
+        there = np.zeros((len(names), self.scenario.network.agents), dtype=bool)
+        there[runs, agent] = True
+        if not there.all():
+            run, lost = (int(i) for i in np.argwhere(~there)[0])
+            where = f" in run '{names[run]}'" if names[run] else ""
+            raise UsageError(
+                f"{found.source}: expected a first estimate of every agent, got none of agent {lost + 1}{where}"
+            )
         where = np.stack([np.zeros_like(agent), agent], axis=1)
         return self._once(found, where, values, [], np.ones(len(found), dtype=bool))
 
@@ -549,7 +591,7 @@ class _Reader:
     def _agent(self, found: Columns, column: str, blank: bool = False) -> np.ndarray:
         """Agents by number from 0; −1 where a cell is empty."""
         codes, names = found.text[column]
-        numbers = np.array([self.agents.get(name.strip(), -1) for name in names])
+        numbers = np.array([self.agents.get(name.strip(), -1) for name in names] or [-1])
         out = np.where(codes >= 0, numbers[codes], -1)
         wrong = (out < 0) & (codes >= 0) if blank else out < 0
         if wrong.any():
@@ -560,11 +602,13 @@ class _Reader:
             raise found.error(row, column, f"an agent from 1 to {n}{listed}", f"'{said}'{nearest(said, known)}")
         return out
 
-    def _check_infinite(self, found: Columns, values: np.ndarray, names: Sequence[str]) -> None:
-        wrong = np.isinf(values)
+    def _check_size(self, found: Columns, values: np.ndarray, names: Sequence[str], expected: str) -> None:
+        wrong = np.abs(values) >= LARGEST
         if wrong.any():
             row, column = (int(i) for i in np.argwhere(wrong)[0])
-            raise found.error(row, names[column], "a finite number or nothing", values[row, column])
+            value = values[row, column]
+            within = f", below {LARGEST:g} in size" if np.isfinite(value) else ""
+            raise found.error(row, names[column], f"{expected}{within}", value)
 
     def _check_width(self, found: Columns, values: np.ndarray, expected: np.ndarray, names: Sequence[str]) -> None:
         there = ~np.isnan(values)
@@ -624,4 +668,4 @@ class _Reader:
                 )
             notes.append(f"{found.source}: {int(again.sum())} rows are there twice, and count once")
         kept = there & ~again
-        return _Given(found, self._run(found, kept), where[kept], values[kept], tuple(notes))
+        return _Given(found, self._run(found, kept), where[kept], values[kept], tuple(notes), np.flatnonzero(kept))

@@ -23,7 +23,8 @@ import numpy as np
 from stochfuse.data.consistency import Average, Series, band
 from stochfuse.data.draw import drawn_arrivals
 from stochfuse.data.records import Batch, read_records
-from stochfuse.engines.progress import listener, within
+from stochfuse.data.suspicions import Suspicion, suspicions
+from stochfuse.engines.progress import listener
 from stochfuse.engines.replay import ArrivalRecord, Stage, moments_given, replay
 from stochfuse.errors import StochfuseError, UsageError, nearest
 from stochfuse.estimators.readings import Readings
@@ -147,6 +148,8 @@ class RunResult(Result):
     traces : each estimator over the steps.
     heard : (steps, agents, agents) what arrived in the first run at once, receiver × sender, itself not counted.
     notes : what the reader should know.
+    suspicions : what may be wrong with the record, or with the scenario, where innovations are far from consistent; the
+        one that explains most first.
     """
 
     scenario: Scenario
@@ -158,6 +161,7 @@ class RunResult(Result):
     heard: np.ndarray
     notes: tuple[str, ...] = ()
     simulated: bool = False
+    suspicions: tuple[Suspicion, ...] = ()
 
 
 class Estimates(NamedTuple):
@@ -190,6 +194,7 @@ class Way:
     seed : of drawn arrivals.
     criterion : what the weights of an intersection minimise.
     predicted : whether errors are predicted too.
+    suspected : whether faults are looked for where innovations are far from what is claimed.
     """
 
     estimators: tuple[str, ...] = (registry.LFG,)
@@ -197,6 +202,7 @@ class Way:
     seed: int = 1
     criterion: str = "det"
     predicted: bool = True
+    suspected: bool = True
 
 
 def way_of(given: Mapping[str, Any], scenario: Scenario) -> Way:
@@ -223,6 +229,14 @@ def way_of(given: Mapping[str, Any], scenario: Scenario) -> Way:
     return Way(names, **rest)
 
 
+def _check_criterion(criterion: str) -> None:
+    if criterion not in registry.CRITERIA:
+        raise UsageError(
+            f"criterion: expected one of {', '.join(registry.CRITERIA)}, got '{criterion}'"
+            f"{nearest(criterion, registry.CRITERIA)}"
+        )
+
+
 @of_scenario
 def run(
     scenario: Scenario,
@@ -245,7 +259,7 @@ def run(
     columns : names that they have for columns, by the names here.
     metric : what errors are shown in; default: the scenario's, else trace.
     **way : estimator (a name or several; default: the scenario's, else local-fusion-graph), link, seed, criterion,
-        predicted (False: predict nothing), see `Way`.
+        predicted (False: predict nothing), suspected (False: look for no faults), see `Way`.
 
     Returns
     -------
@@ -290,6 +304,7 @@ def run_records(
     NoAnswerError
         If an estimator claims no covariance in some run.
     """
+    _check_criterion(way.criterion)
     scenario = records.scenario
     links = None
     if not records.given or way.link is not None or scenario.network.link is not None or scenario.network.cases:
@@ -299,16 +314,18 @@ def run_records(
             "arrivals are drawn from the scenario's links: expected one link probability; give --link or --arrivals"
         )
     tallies = {name: Tally(records, name, way.criterion) for name in way.estimators}
-    heard, done = None, 0
+    done, total = 0, len(records.names) * len(way.estimators) * scenario.network.steps
+    heard, suspected = None, ()
     for batch in records.batches():
         arrivals = batch.arrivals
         if arrivals is None:
             arrivals = drawn_arrivals(scenario.system, links, batch.missed, way.seed, int(batch.runs[0]))  # type: ignore[arg-type]
-        heard = _heard(arrivals) if heard is None else heard
-        done += len(batch.runs)
+        if heard is None:
+            heard = _heard(arrivals)
+            suspected = suspicions(scenario, batch, records.known) if way.suspected else ()
         for tally in tallies.values():
-            with within(f"runs up to {done:,}", done, len(records.names)):
-                tally.add(batch, arrivals, write)
+            tally.add(batch, arrivals, write, (done, total))
+            done += len(batch.runs) * scenario.network.steps
     rows, notes = [], list(records.notes)
     for tally in tallies.values():
         expected = _expected(scenario, links, tally.estimator, way) if way.predicted else PredictedSquare(None, "", ())
@@ -325,6 +342,7 @@ def run_records(
         tuple(tally.trace() for tally in tallies.values()),
         heard,
         tuple(dict.fromkeys(notes)),
+        suspicions=suspected,
     )
 
 
@@ -372,8 +390,14 @@ class Tally:
         self._given, self._given_count = np.zeros((steps, n, d, d)), 0
         self._shown: list[np.ndarray] = []
 
-    def add(self, batch: Batch, arrivals: ArrivalRecord, write: Callable[[Estimates], None] | None) -> None:
-        """Run a batch."""
+    def add(
+        self,
+        batch: Batch,
+        arrivals: ArrivalRecord,
+        write: Callable[[Estimates], None] | None = None,
+        work: tuple[int, int] = (0, 1),
+    ) -> None:
+        """Run a batch; `work`: steps of runs that were gone through before, and all."""
         system, known = self.records.scenario.system, self.records.known
         shape = (len(batch.runs), system.steps, system.agents)
         nees, nis = np.full(shape, np.nan), np.full(shape, np.nan)
@@ -381,6 +405,7 @@ class Tally:
         first = not self._shown
         for stage in stages(self.records, batch, arrivals, self.estimator, self.criterion):
             k = stage.step - 1
+            listener().advance("running estimators", work[0] + stage.step * len(batch.runs), work[1])
             x = np.stack([estimate.x[..., 0] for estimate in stage.estimates], axis=1)
             P = np.stack([estimate.P for estimate in stage.estimates], axis=1)
             nis[:, k] = stage.nis
@@ -394,7 +419,6 @@ class Tally:
                 there = np.ones(x.shape[:2], dtype=bool)
             self._claim[k] += np.einsum("ra,raij->aij", there, P)
             self._count[k] += there.sum(axis=0)
-            listener().advance(f"{self.estimator}, steps", stage.step, system.steps)
             if first:
                 self._shown.append(np.stack([x[0], np.diagonal(P[0], axis1=-2, axis2=-1)]))
             if write is not None:

@@ -135,7 +135,7 @@ def simulate(
     >>> found.rows[0].verdict
     'consistent'
     """
-    how = way_of(way, scenario)
+    how = replace(way_of(way, scenario), suspected=False)
     if runs < 1:
         raise UsageError(f"runs: expected at least 1, got {runs}")
     links = link_rows(scenario, None if how.link is None else [how.link])

@@ -198,7 +198,8 @@ class RecordFiles:
             run, step = np.nonzero(seen(agent))
             parts.append((run, step, np.full(len(run), agent), np.full(len(run), -1), z[run, step]))
         for (i, j), z in batch.relations.items():
-            run, step = (index.ravel() for index in np.indices(z.shape[:2]))
+            run, step = (index.ravel() for index in np.indices((z.shape[0], z.shape[1] - 1)))
+            step = step + 1  # nothing is measured at step 1
             parts.append((run, step, np.full(len(run), i), np.full(len(run), j), z[run, step]))
         padded = [np.full((len(part[0]), self._most), np.nan) for part in parts]
         for wide, part in zip(padded, parts, strict=True):

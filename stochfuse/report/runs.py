@@ -145,6 +145,7 @@ def run_json(found: RunResult) -> dict[str, Any]:
         "steps": found.scenario.network.steps,
         "arrivals": "drawn" if found.drawn else "recorded",
         "rows": rows,
+        "suspicions": [each._asdict() for each in found.suspicions],
         "scenario": found.scenario.to_mapping(),
         "meta": {"description": list(_titles(found)), "notes": list(found.notes)},
     }
