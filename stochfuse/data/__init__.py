@@ -6,6 +6,7 @@ results beside the prediction and says what would explain a difference.
 
     records, writing          the files of a run, read and written
     run, consistency          estimators on records; are they as good as they claim
+    innovations, suspicions   how likely a record is; what would explain that it is not
     draw, simulate            records that chance decides
     tables, columns           a table from wherever it is, as NumPy columns; what is wrong by line and column
     results                   what a simulator found

@@ -33,7 +33,7 @@ from stochfuse.scenario.scenario import Scenario
 from stochfuse.scenario.sensing import Instrument, parts_of
 from stochfuse.scenario.system import System
 
-RUNS, STEPS, MEASURED = 20, 2_000, 3_000
+RUNS, STEPS, MEASURED = 20, 2_000, 2_000
 MARGIN = 10.0
 """Least gain of log-likelihood for a suspicion to be told."""
 CHANCE = 1e-5
