@@ -253,12 +253,6 @@ def _single(links: list[float] | None, kind: str) -> float:
 
 
 def _note(sheet: SolutionSheet) -> None:
-    if sheet.kind == "sensitivity" and sheet.question.method == SIMPLIFIED and sheet.question.agent != "mean":
-        typer.echo(
-            "note: the simplified formulation lets an agent's prior stand for the others' too, so that only links to "
-            "the agent count; see --method general or optimal",
-            err=True,
-        )
     for note in sheet.prediction.notes:
         typer.echo(f"note: {note}", err=True)
     if sheet.question.metric.mixed:

@@ -273,6 +273,11 @@ def departures(system: System, rows: LinkRows) -> list[str]:
                 "some links have probability 0: on a masked network (54) is an approximation outside its derivation, "
                 "evaluated with the possible senders of each agent"
             )
+    if system.agents > 1 and (len(set(system.sensor_of)) > 1 or not rows.uniform):
+        notes.append(
+            "agents or links differ: (54) lets an agent's own prior stand for the others', so that only links to it "
+            "count, and may be tens of per cent off; --method general or monte-carlo tells"
+        )
     return notes
 
 

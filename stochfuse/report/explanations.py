@@ -31,7 +31,7 @@ TERMS = {
     "approximate": (
         "The mean field: after every step the average covariance stands for all outcomes, and the next "
         "step goes on from it. Fast for any number of agents; within a few per cent of the exact average "
-        "where links are alike."
+        "where agents and links are alike, and tens of per cent off where they are not."
     ),
     "bound": "The value is proved to lie within the relative distance that a note gives.",
     "sampled": (

@@ -91,14 +91,20 @@ def test_masked_network_is_noted_and_a_full_one_is_not():
     rng = np.random.default_rng(4)
     matrix = [[0, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0]]
     masked = sf.predict(scenario(*model(rng, 1, 1), agents=3, steps=2, link=matrix))
+    unlike = (
+        "agents or links differ: (54) lets an agent's own prior stand for the others', so that only links to it count, "
+        "and may be tens of per cent off; --method general or monte-carlo tells"
+    )
     assert masked.notes == (
         "some links have probability 0: on a masked network (54) is an approximation outside its derivation, "
         "evaluated with the possible senders of each agent",
+        unlike,
     )
     full = sf.predict(
         scenario(*model(rng, 1, 1), agents=3, steps=2, link=[[0, 0.5, 0.1], [0.2, 0, 0.1], [0.2, 0.5, 0]])
     )
-    assert full.notes == ()
+    assert full.notes == (unlike,)
+    assert sf.predict(scenario(*model(rng, 1, 1), agents=3, steps=2), [0.5]).notes == ()
 
 
 def test_equal_entries_of_a_matrix_are_the_same_as_one_number():

@@ -21,7 +21,7 @@ import stochfuse as sf
 from stochfuse.cli.app import app
 from stochfuse.scenario.scenario import parse, preset_names, read_text
 from stochfuse.studies.evaluation import evaluate
-from stochfuse.studies.files import Columns
+from stochfuse.studies.files import PlanColumns
 from stochfuse.studies.reading import load_study
 
 FEW, MANY = 80, 700
@@ -295,7 +295,7 @@ def read_and_evaluate(mapping: dict[str, Any]) -> str:
         return "read"
     points = range(min(plan.size, plan.chunk, 4))
     found = evaluate(plan, points)
-    columns = Columns(plan).of(points, found)
+    columns = PlanColumns(plan).of(points, found)
     assert all(len(values) == found.rows.sum() for values, _ in columns.values())
     assert len(found.steps) == len(points)
     assert set(found.errors) == {points[i] for i in np.flatnonzero(found.steps == 0)}
