@@ -248,9 +248,13 @@ def _runs_of(block: int, runs: int) -> int:
 
 def _draw(experiment: Experiment, row: int, block: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Fates and misses of a block, see `draw_fates`."""
-    generator = np.random.default_rng(np.random.SeedSequence(experiment.seed, spawn_key=(row, block)))
-    runs = _runs_of(block, experiment.runs)
-    return draw_fates(generator, experiment.events, experiment.detections, (runs, experiment.agents), row)
+    size = _runs_of(block, experiment.runs), experiment.agents
+    return draw_fates(stream(experiment.seed, row, block), experiment.events, experiment.detections, size, row)
+
+
+def stream(seed: int, row: int, number: int) -> np.random.Generator:
+    """Random numbers of a block of runs, or of one run, of a row."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(row, number)))
 
 
 def draw_fates(
