@@ -13,12 +13,12 @@ and the filter of agent i runs along its own sets, J_j = H_jᵀR_j⁻¹H_j of st
 
 A message sent at step s that arrives at k brings the rows that its sender had before its exchange at s.
 
-What makes it fast.  Sets are rows of bits, 64 agents a word, so that a product is one OR for every message that arrived.
-Steps whose data everybody holds drop out of the products.  At every step an agent's filter is run again only from the first
-t on whose set has grown.  Runs are followed in blocks that fit in memory, and blocks by threads; neither changes a number.
+What makes it fast.  Sets are rows of bits, 64 agents a word, so that a product is one OR for each arrival.  Steps whose
+data everybody holds drop out of the products.  At every step an agent's filter is run again only from the first t on
+whose set has grown.  Runs are followed in blocks that fit in memory, and blocks by threads; neither changes a number.
 
-Random numbers.  Up to `MOST_PAIRED` agents they are those of `stochfuse.engines.monte_carlo`: the same arrivals as of any
-other estimator.  Beyond, every run has a stream of its own and probabilities are rounded to multiples of 2⁻³².
+Random numbers.  Up to `MOST_PAIRED` agents they are those of `stochfuse.engines.monte_carlo`: the same arrivals as of
+any other estimator.  Beyond, every run has a stream of its own and probabilities are rounded to multiples of 2⁻³².
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ MOST_COUNTED = 8
 """Kinds of sensors up to which the members of a set are counted by kind; beyond, their information is added up."""
 UNPACKED = 4096
 """Sets whose members are unpacked at a time."""
-WORD, LARGEST = 64, 2**64 - 1
+WORD = 64
 
 
 class OptimumSample(NamedTuple):
@@ -181,9 +181,7 @@ class _Outcomes:
         self.links = [links[id(now)] for now in drawn]
 
 
-def _paired(
-    given: _Outcomes, row: int, block: range, size: int
-) -> Iterator[tuple[range, Iterator[_Arrivals]]]:
+def _paired(given: _Outcomes, row: int, block: range, size: int) -> Iterator[tuple[range, Iterator[_Arrivals]]]:
     """Some runs at a time of a block, with what becomes of each step, as `monte_carlo` draws it."""
     random = stream(given.seed, row, block.start // BLOCK)
     fates, missed = draw_fates(random, given.drawn, given.detections, (len(block), given.system.agents), row)
@@ -213,17 +211,30 @@ def _words_followed(given: _Outcomes, row: int, streams: Sequence[np.random.Gene
             agents, p = np.array(detections).T
             missed = np.zeros((len(streams), given.system.agents), dtype=bool)
             missed[:, agents.astype(int)] = ~_below(_words(streams, len(agents)), _threshold(p))
+        arrival = now.arrival
         if now.burst is not None:
-            stay, bad_now = now.burst, _words(streams, len(drawn))
-            bad = _below(bad_now, stay[0]) if bad is None else np.where(bad, _below(bad_now, stay[2]), _below(bad_now, stay[1]))
-            thresholds = np.where(bad, stay[4], stay[3])
-        else:
-            thresholds = now.arrival
-        fates = _below(_words(streams, len(drawn)), thresholds).view(np.uint8)
-        if now.late is not None:
+            bad = now.burst.next(bad, _words(streams, len(drawn)))
+            arrival = np.where(bad, now.burst.bad, now.burst.good)
+        fates = _below(_words(streams, len(drawn)), arrival).view(np.uint8)
+        if now.late:
             words = _words(streams, len(drawn))
-            fates = fates * (1 + sum(~_below(words, upto) for upto in now.late).astype(np.uint8))
+            late = np.array([~_below(words, upto) for upto in now.late]).sum(axis=0, dtype=np.uint8)
+            fates = fates * (late + np.uint8(1))
         yield _Arrivals(links.arrived(fates), missed)
+
+
+class _Burst(NamedTuple):
+    """Thresholds of bursty links: to be bad at first, to turn bad, to stay bad, and to deliver when good and bad."""
+
+    first: np.ndarray
+    turn: np.ndarray
+    stay: np.ndarray
+    good: np.ndarray
+    bad: np.ndarray
+
+    def next(self, bad: np.ndarray | None, words: np.ndarray) -> np.ndarray:
+        """Whether links are bad, from whether they were; None before the first step."""
+        return _below(words, self.first if bad is None else np.where(bad, self.stay, self.turn))
 
 
 class _Chances:
@@ -231,10 +242,10 @@ class _Chances:
 
     def __init__(self, drawn: Sequence[Event], row: int) -> None:
         self.arrival = _threshold(np.array([event.probability[row] for event in drawn]))
-        self.burst, self.late = None, None
+        self.burst, self.late = None, []
         if any(event.burst is not None for event in drawn):
             to_bad, to_good, good, bad = np.array([e.burst[row] for e in drawn if e.burst is not None]).T
-            self.burst = [_threshold(p) for p in (to_bad / (to_bad + to_good), to_bad, 1.0 - to_good, good, bad)]
+            self.burst = _Burst(*map(_threshold, (to_bad / (to_bad + to_good), to_bad, 1.0 - to_good, good, bad)))
         longest = max((len(event.delay) for event in drawn), default=1)
         if longest > 1:
             upto = np.array([np.cumsum([*e.delay, *(0.0,) * (longest - len(e.delay))]) for e in drawn])
@@ -246,7 +257,7 @@ def _words(streams: Sequence[np.random.Generator], count: int) -> np.ndarray:
     """Random words of 32 bits, (streams, count)."""
     out = np.empty((len(streams), -(-count // 2)), dtype=np.uint64)
     for words, each in zip(out, streams, strict=True):
-        words[:] = each.integers(0, LARGEST, len(words), np.uint64, endpoint=True)
+        words[:] = each.bit_generator.random_raw(len(words))
     return out.view(np.uint32)[:, :count]
 
 
@@ -291,12 +302,25 @@ def _followed(
         for delay in range(min(k + 1, max(map(len, schedule)))):
             if delay < len(schedule[k - delay]):
                 _joined(sets, low, before[k - delay], schedule[k - delay][delay])
-        grown = (sets[:, :-1] != held[:, :-1]).any(axis=2)
+        grown = _in_any_word(sets[:, :-1] != held[:, :-1])
         first = np.where(grown.any(axis=1), grown.argmax(axis=1) if grown.shape[1] else 0, k - low)
         yield riccati.after(filters, sets, low, first, (runs, agents))
         while sets.shape[1] and (sets[:, 0].reshape(runs, agents, -1) == most[low][:, None]).all():
             sets, low = sets[:, 1:], low + 1
         _forget(before, schedule, k)
+
+
+def _in_any_word(words: np.ndarray) -> np.ndarray:
+    """Whether any of the words on the last axis is true: few words, so that one after the other is fastest."""
+    return np.logical_or.reduce([words[..., word] for word in range(words.shape[-1])])
+
+
+def _members(sets: np.ndarray) -> np.ndarray:
+    """Numbers of members of sets (..., words)."""
+    total = np.zeros(sets.shape[:-1])
+    for word in range(sets.shape[-1]):
+        total += np.bitwise_count(sets[..., word])
+    return total
 
 
 def _own_bits(agents: int) -> np.ndarray:
@@ -316,9 +340,7 @@ def _forget(before: list, schedule: list, k: int) -> None:
         schedule[gone] = []
 
 
-def _joined(
-    sets: np.ndarray, low: int, sent: tuple[int, np.ndarray], pairs: tuple[np.ndarray, np.ndarray]
-) -> None:
+def _joined(sets: np.ndarray, low: int, sent: tuple[int, np.ndarray], pairs: tuple[np.ndarray, np.ndarray]) -> None:
     """Let receivers hold, in place, what senders held when they sent."""
     since, held = sent
     held = held[:, low - since :]
@@ -330,10 +352,11 @@ def _joined(
     # those that hear most come first: all that are left at every round are then the first so many
     order = np.argsort(-number, kind="stable")
     starts, rounds = starts[order], np.cumsum(np.bincount(number)[::-1])[::-1]
-    brought = held[sender[starts]]
+    flat = np.ascontiguousarray(held).reshape(len(held), -1)
+    brought = flat.take(sender[starts], axis=0)
     for heard in range(1, len(rounds) - 1):
-        brought[: rounds[heard + 1]] |= held[sender[starts[: rounds[heard + 1]] + heard]]
-    sets[receiver[starts], : held.shape[1]] |= brought
+        brought[: rounds[heard + 1]] |= flat.take(sender[starts[: rounds[heard + 1]] + heard], axis=0)
+    sets[receiver[starts], : held.shape[1]] |= brought.reshape(-1, *held.shape[1:])
 
 
 # the filter along them
@@ -393,7 +416,7 @@ class _Riccati:
         """Filters of some items after step t + 1, from those after t, with the measurements of the agents held."""
         x, P = kept.x, kept.P
         if t == 0:
-            start = self._start(np.bitwise_count(held).sum(axis=-1, dtype=float))
+            start = self._start(_members(held))
         else:
             before = Estimate(None if x is None else x[t - 1][:, some], P[t - 1][..., some])
             start = self._in_roots(before, held, t) if self.precise else self._in_information(before, held, t)
@@ -427,7 +450,7 @@ class _Riccati:
 
     def _counts(self, held: np.ndarray) -> np.ndarray:
         """How many members of sets are of each kind, (kinds, items)."""
-        return np.array([np.bitwise_count(held & mask).sum(axis=-1, dtype=float) for mask in self.of_kind])
+        return np.array([_members(held & mask) for mask in self.of_kind])
 
     def _information(self, held: np.ndarray, t: int) -> np.ndarray:
         """Σ of J_j over sets of agents, (d, d, items)."""
