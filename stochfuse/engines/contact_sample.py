@@ -124,8 +124,15 @@ def _drawn(system: System, links: LinkRows) -> list[list[Event]]:
     n, K = system.agents, system.steps
     drawn = [events(system.network, links, step) for step in range(1, K + 1 if links.varies else 2)]
     if n > MOST_PAIRED:
-        drawn = [[e for e in now if e.burst is not None or (_threshold(e.probability) > 0).any()] for now in drawn]
+        drawn = [_possible(now) for now in drawn]
     return drawn if links.varies else drawn * K
+
+
+def _possible(drawn: list[Event]) -> list[Event]:
+    if not drawn:
+        return drawn
+    possible = (_threshold(np.array([event.probability for event in drawn])) > 0).any(axis=1)
+    return [event for event, ever in zip(drawn, possible, strict=True) if ever or event.burst is not None]
 
 
 def _bytes_of_a_run(system: System, drawn: int) -> int:
