@@ -15,7 +15,7 @@ A message sent at step s that arrives at k brings the rows that its sender had b
 
 What makes it fast.  Sets are rows of bits, 64 agents a word, so that a product is one OR for each arrival.  Steps whose
 data everybody holds drop out of the products.  At every step an agent's filter is run again only from the first t on
-whose set has grown.  Runs are followed in blocks that fit in memory, and blocks by threads; neither changes a number.
+whose set has grown.  Runs are followed in blocks that fit in memory, and blocks by processes; neither changes a number.
 
 Random numbers.  Up to `MOST_PAIRED` agents they are those of `stochfuse.engines.monte_carlo`: the same arrivals as of
 any other estimator.  Beyond, every run has a stream of its own and probabilities are rounded to multiples of 2⁻³².
@@ -24,15 +24,15 @@ any other estimator.  Beyond, every run has a stream of its own and probabilitie
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from stochfuse.engines.contact_chain import AlongPath, LosslessFilter
 from stochfuse.engines.events import Event, events
-from stochfuse.engines.monte_carlo import BLOCK, draw_fates, stream
+from stochfuse.engines.monte_carlo import BLOCK, draw_fates, quietly, stopped_together, stream
 from stochfuse.engines.precision import suspects
 from stochfuse.engines.progress import listener
 from stochfuse.kalman.kernel import Estimate, from_factor, taken_in
@@ -45,6 +45,8 @@ MOST_BYTES = 1 << 25
 """Memory that a block of runs takes at a time, about."""
 MOST_COUNTED = 8
 """Kinds of sensors up to which the members of a set are counted by kind; beyond, their information is added up."""
+MANY = 20_000_000
+"""Events drawn, over all rows, from which on another process pays for its start."""
 UNPACKED = 4096
 """Sets whose members are unpacked at a time."""
 WORD = 64
@@ -88,7 +90,7 @@ def sample_optimum(
     ----------
     links : rows of link probabilities, `runs` outcomes for each.
     runs, seed : size of the sample per row, and its seed; more runs of a seed begin with the fewer.
-    workers : threads; default: one per processor.
+    workers : processes that share the work; default: one for small samples, else one per processor.
     most_bytes : memory that a block of runs may take; the sample does not depend on it.
 
     Notes
@@ -102,21 +104,60 @@ def sample_optimum(
     size = max(1, most_bytes // _bytes_of_a_run(system, max(map(len, drawn))))
     source, stride = (_paired, BLOCK) if n <= MOST_PAIRED else (_own, size)
     blocks = [(row, range(first, min(first + stride, runs))) for row in range(rows) for first in range(0, runs, stride)]
-    outcomes, riccati = _Outcomes(system, drawn, seed), _Riccati(system)
-
-    def follow(block: tuple[int, range]) -> None:
-        row, block_runs = block
-        for some, fates in source(outcomes, row, block_runs, size):
-            for k, (now, left) in enumerate(_followed(riccati, fates, len(some), n)):
-                P[row, some.start : some.stop, k] = now
-                if bias is not None and left is not None:
-                    bias[row, some.start : some.stop, k] = left
-
-    threads = min(len(blocks), workers or len(os.sched_getaffinity(0)))
-    with ThreadPoolExecutor(threads) as pool:
-        for done, _ in enumerate(pool.map(follow, blocks), start=1):
-            listener().advance("sampling", done, len(blocks))
+    work = _Work(_Outcomes(system, drawn, seed), _Riccati(system), source, size)
+    if workers is None:
+        workers = len(os.sched_getaffinity(0)) if rows * runs * sum(map(len, drawn)) >= MANY else 1
+    for done, (row, first, now, left) in enumerate(_all_followed(work, blocks, min(workers, len(blocks))), start=1):
+        P[row, first : first + len(now)] = now
+        if bias is not None:
+            bias[row, first : first + len(now)] = left
+        listener().advance("sampling", done, len(blocks))
     return OptimumSample(P, bias)
+
+
+class _Work(NamedTuple):
+    """What a process needs to follow blocks of runs, so many runs at a time."""
+
+    outcomes: _Outcomes
+    riccati: _Riccati
+    source: Callable[[_Outcomes, int, range, int], Iterator[tuple[range, Iterator[_Arrivals]]]]
+    size: int
+
+    def follow(self, block: tuple[int, range]) -> tuple[int, int, np.ndarray, np.ndarray | None]:
+        """Row and first run of a block, covariances (runs, steps, agents, d, d) and biases (…, d, 1)."""
+        row, runs = block
+        system = self.outcomes.system
+        P = np.empty((len(runs), system.steps, system.agents, system.dimension, system.dimension))
+        bias = None if system.error is None else np.empty((*P.shape[:-1], 1))
+        for some, fates in self.source(self.outcomes, row, runs, self.size):
+            part = slice(some.start - runs.start, some.stop - runs.start)
+            for k, (now, left) in enumerate(_followed(self.riccati, fates, len(some), system.agents)):
+                P[part, k] = now
+                if bias is not None:
+                    bias[part, k] = left
+        return row, runs.start, P, bias
+
+
+def _all_followed(work: _Work, blocks: Sequence[tuple[int, range]], workers: int) -> Iterator[Any]:
+    """Every block followed, in order: by processes that share them, or here."""
+    if workers == 1:
+        yield from map(work.follow, blocks)
+        return
+    with ProcessPoolExecutor(workers, initializer=_begin, initargs=(work,)) as pool, stopped_together():
+        yield from pool.map(_follow, blocks)
+
+
+_shared: list[_Work] = []
+"""What a process that follows blocks was started with: too large to be sent with every block."""
+
+
+def _begin(work: _Work) -> None:
+    quietly()
+    _shared[:] = [work]
+
+
+def _follow(block: tuple[int, range]) -> Any:
+    return _shared[0].follow(block)
 
 
 def _drawn(system: System, links: LinkRows) -> list[list[Event]]:
@@ -129,10 +170,9 @@ def _drawn(system: System, links: LinkRows) -> list[list[Event]]:
 
 
 def _possible(drawn: list[Event]) -> list[Event]:
-    if not drawn:
-        return drawn
-    possible = (_threshold(np.array([event.probability for event in drawn])) > 0).any(axis=1)
-    return [event for event, ever in zip(drawn, possible, strict=True) if ever or event.burst is not None]
+    thresholds = _threshold(np.array([event.probability for event in drawn]))
+    ever = set(np.nonzero(thresholds)[0].tolist())
+    return [event for number, event in enumerate(drawn) if number in ever or event.burst is not None]
 
 
 def _bytes_of_a_run(system: System, drawn: int) -> int:
