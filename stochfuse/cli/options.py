@@ -20,7 +20,7 @@ import typer
 from stochfuse.cli.progress import quiet
 from stochfuse.errors import UsageError, nearest
 from stochfuse.scenario import registry
-from stochfuse.scenario.registry import CRITERIA, ESTIMATORS, GENERAL, METHODS, MONTE_CARLO, NAIVE, QUANTITIES
+from stochfuse.scenario.registry import CRITERIA, ESTIMATORS, GENERAL, METHODS, MONTE_CARLO, NAIVE, OPTIMAL, QUANTITIES
 
 if TYPE_CHECKING:
     from stochfuse.report.table import Report
@@ -351,7 +351,7 @@ APPLIES_TO = {
     "workers": SAMPLED,
     "criterion": BOTH,
 }
-"""Methods that each setting means something to."""
+"""Methods that each setting means something to; the optimum of many unlike agents is sampled too."""
 
 
 def settings_for(methods: Sequence[str], **settings: Any) -> dict[str, Any]:
@@ -364,7 +364,8 @@ def settings_for(methods: Sequence[str], **settings: Any) -> dict[str, Any]:
     """
     given = {name: value for name, value in settings.items() if value is not None and value is not False}
     for name in given:
-        if not set(APPLIES_TO[name]) & set(methods):
+        also = {OPTIMAL} if APPLIES_TO[name] == SAMPLED else set()
+        if not (also | set(APPLIES_TO[name])) & set(methods):
             option = "--" + name.replace("_", "-")
             raise UsageError(f"{option}: expected method {' or '.join(APPLIES_TO[name])}, got {', '.join(methods)}")
     return given

@@ -240,7 +240,7 @@ def _of_sets(
     """Unequal links or unlike agents.  A state is a number with a digit per agent: 0, or 1 + its age if it is in."""
     n, base = network.agents, oldest + 2
     if n > MOST_UNLIKE:
-        raise UsageError(
+        raise TooManyUnlikeError(
             f"method 'optimal' takes at most {MOST_UNLIKE} agents where they or their links differ, got {n}: use "
             "--method monte-carlo with --estimator optimal"
         )
@@ -417,6 +417,10 @@ class Chain(NamedTuple):
     bound: np.ndarray
     paths: int | None
     rounding: np.ndarray | float = 0.0
+
+
+class TooManyUnlikeError(UsageError):
+    """More unlike agents than sets of them can be gone through."""
 
 
 class TooManyPathsError(UsageError):

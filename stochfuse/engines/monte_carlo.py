@@ -81,11 +81,11 @@ def sample(experiment: Experiment, rows: int, *, workers: int = 1) -> Sample:
     index = np.empty((rows, experiment.runs, len(experiment.events), experiment.agents), np.int32)
     values: list[Any] = []
     pool: Any = (
-        ProcessPoolExecutor(min(workers, len(parts)), initializer=_quietly)
+        ProcessPoolExecutor(min(workers, len(parts)), initializer=quietly)
         if min(workers, len(parts)) > 1
         else nullcontext()
     )
-    with pool as executor, _stopped_together():
+    with pool as executor, stopped_together():
         if executor is None:
             found = map(run_blocks, repeat(experiment), parts)
         else:
@@ -104,7 +104,7 @@ def sample(experiment: Experiment, rows: int, *, workers: int = 1) -> Sample:
 
 
 @contextmanager
-def _stopped_together() -> Iterator[None]:
+def stopped_together() -> Iterator[None]:
     """Let no process go on working for a result that nobody waits for."""
     try:
         yield
@@ -114,7 +114,7 @@ def _stopped_together() -> Iterator[None]:
         raise
 
 
-def _quietly() -> None:
+def quietly() -> None:
     """Let Ctrl-C end a worker without a traceback: the parent tells the user."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
@@ -248,9 +248,13 @@ def _runs_of(block: int, runs: int) -> int:
 
 def _draw(experiment: Experiment, row: int, block: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Fates and misses of a block, see `draw_fates`."""
-    generator = np.random.default_rng(np.random.SeedSequence(experiment.seed, spawn_key=(row, block)))
-    runs = _runs_of(block, experiment.runs)
-    return draw_fates(generator, experiment.events, experiment.detections, (runs, experiment.agents), row)
+    size = _runs_of(block, experiment.runs), experiment.agents
+    return draw_fates(stream(experiment.seed, row, block), experiment.events, experiment.detections, size, row)
+
+
+def stream(seed: int, row: int, number: int) -> np.random.Generator:
+    """Random numbers of a block of runs, or of one run, of a row."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(row, number)))
 
 
 def draw_fates(

@@ -157,6 +157,34 @@ def update_information(
     return Information(y + HtRinv @ z, algebra.symmetric(Y + HtRinv @ H))
 
 
+def taken_in(P: np.ndarray, J: np.ndarray, x: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray | None]:
+    """Covariance after measurements that bring information J, (I + PJ)⁻¹P, and (I + PJ)⁻¹x of an error x.
+
+    For floating point only, of many small matrices side by side: their entries are on the *first* axes.  P and J may be
+    singular.  As accurate as the condition number of I + PJ lets it be.
+
+    Parameters
+    ----------
+    P, J : (d, d, ...) prior covariance, and HᵀR⁻¹H of the measurements together.
+    x : (d, ...) prior error, or None.
+    """
+    d = len(P)
+    if d == 1:
+        left = 1.0 / (1.0 + P * J)
+        return P * left, None if x is None else x * left[0]
+    M = np.einsum("ij...,jk...->ik...", P, J)
+    M[range(d), range(d)] += 1.0
+    both = P if x is None else np.concatenate([P, x[:, None]], axis=1)
+    if d == 2:
+        adjugate = np.array([[M[1, 1], -M[0, 1]], [-M[1, 0], M[0, 0]]])
+        both = np.einsum("ij...,jk...->ik...", adjugate, both) / (M[0, 0] * M[1, 1] - M[0, 1] * M[1, 0])
+    else:
+        solved = np.linalg.solve(np.moveaxis(M, (0, 1), (-2, -1)), np.moveaxis(both, (0, 1), (-2, -1)))
+        both = np.moveaxis(solved, (-2, -1), (0, 1))
+    P = both[:, :d]
+    return 0.5 * (P + P.swapaxes(0, 1)), None if x is None else both[:, d]
+
+
 def factor(P: np.ndarray) -> np.ndarray:
     """Square root L of a positive semi-definite P, P = L Lᵀ, for stacks (..., d, d), singular ones included.
 

@@ -3,20 +3,24 @@
 The contact chain (`stochfuse.engines.contact_chain`) has one path for every history of counts, the same for every item.
 The filter runs along each path, in square-root form, once for all items or, where they have noises of their own, for
 each of them; every item's paths are weighed with its own link probabilities.  Where paths are too many for that, the
-optimum is enclosed in bounds (`stochfuse.engines.enclosure`).
+optimum is enclosed in bounds (`stochfuse.engines.enclosure`); where agents or links are unlike and sets of agents too
+many for a chain, it is sampled (`stochfuse.engines.contact_sample`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from stochfuse.engines.contact_chain import (
+    MOST_UNLIKE,
     Chain,
     Contacts,
     LosslessFilter,
     TooManyPathsError,
+    TooManyUnlikeError,
     by_counts,
     check_size,
     contacts,
@@ -30,6 +34,7 @@ from stochfuse.engines.events import relabellings
 from stochfuse.engines.precision import PROMISED, Moving, change, notes, reach, suspects
 from stochfuse.errors import UsageError
 from stochfuse.kalman.metrics import Moments
+from stochfuse.prediction import sampled
 from stochfuse.prediction.general import groups_alike
 from stochfuse.prediction.method import Averaged, Settings, group_of
 from stochfuse.prediction.method import joined as joined_items
@@ -53,7 +58,10 @@ def averaged(system: System, items: Items, how: Settings, errors: bool) -> Avera
     """
     links, network = items.links, system.network
     groups = groups_of(system, links)
-    chain = contacts(network, links, system.sensor_of, groups, system.detects)
+    try:
+        chain = contacts(network, links, system.sensor_of, groups, system.detects)
+    except TooManyUnlikeError:
+        return _sampled(system, items, how, errors)
     paths = number_of_paths(network) if counted(system, links) else None
     try:
         if paths is not None:
@@ -77,6 +85,13 @@ def averaged(system: System, items: Items, how: Settings, errors: bool) -> Avera
         notes=(*said, *notes(float(far.max()))),
         meta={"paths": found.paths if paths is None else paths, "relative_bound": found.bound.tolist()},
     )
+
+
+def _sampled(system: System, items: Items, how: Settings, errors: bool) -> Averaged:
+    """Sample the optimum of more unlike agents than a chain takes."""
+    found = sampled.averaged(system, items, replace(how, estimator=OPTIMAL), errors)
+    said = f"more than {MOST_UNLIKE} unlike agents or links: sampled, {how.runs:,} runs; ± standard error"
+    return found._replace(notes=(*found.notes, said))
 
 
 def _every_path(system: System, items: Items, chain: Contacts, paths: int | None) -> Chain:

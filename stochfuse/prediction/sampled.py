@@ -15,6 +15,7 @@ from functools import partial
 
 import numpy as np
 
+from stochfuse.engines.contact_sample import sample_optimum
 from stochfuse.engines.events import events, relabellings
 from stochfuse.engines.monte_carlo import Experiment, Sample, sample
 from stochfuse.errors import UsageError
@@ -26,10 +27,13 @@ from stochfuse.prediction.general import groups_alike
 from stochfuse.prediction.method import Averaged, Settings, group_of, joined
 from stochfuse.prediction.quantities import needed, value
 from stochfuse.scenario.network import LinkRows
+from stochfuse.scenario.registry import OPTIMAL
 from stochfuse.scenario.system import Items, Noises, System
 
 MOST_AGENTS, MOST_NUMBERS = 60, 500_000_000
 """Agents whose sets fit a machine word, and claimed values that a sample may hold."""
+MOST_OF_OPTIMUM, FEW, MOST_ENTRIES = 1000, 12, 200_000_000
+"""Agents of the optimum; those up to which equal histories, gathered, pay; entries of its covariances in a sample."""
 MANY = 10_000
 """Runs, over all rows, from which on another process pays for its start."""
 ROUNDING = 1e-13
@@ -132,8 +136,9 @@ def sampled(system: System, links: LinkRows, how: Settings, *, errors: bool = Fa
         if value_of < least:
             raise UsageError(f"{name}: expected a whole number of at least {least}, got {value_of}")
     network, kinds, rows = system.network, system.labels, len(links.link)
-    if network.agents > MOST_AGENTS:
-        raise UsageError(f"method 'monte-carlo' takes at most {MOST_AGENTS} agents, got {network.agents}")
+    most = MOST_OF_OPTIMUM if how.estimator == OPTIMAL else MOST_AGENTS
+    if network.agents > most:
+        raise UsageError(f"method 'monte-carlo' takes at most {most} agents, got {network.agents}")
     numbers = how.runs * rows * network.steps * network.agents
     if numbers > MOST_NUMBERS:
         raise UsageError(
@@ -141,6 +146,9 @@ def sampled(system: System, links: LinkRows, how: Settings, *, errors: bool = Fa
             f"are {numbers:.3g} values; expected at most {MOST_NUMBERS:.3g}"
         )
     permutations = relabellings(network, links, kinds)
+    groups = groups_alike(network, links, kinds, permutations)
+    if how.estimator == OPTIMAL and network.agents > FEW:
+        return _optimum(system, links, how, groups, errors)
     experiment = Experiment(
         agents=network.agents,
         events=[events(network, links, step) for step in range(1, network.steps + 1)],
@@ -154,7 +162,28 @@ def sampled(system: System, links: LinkRows, how: Settings, *, errors: bool = Fa
     if workers is None:
         workers = len(os.sched_getaffinity(0)) if how.runs * rows >= MANY else 1
     drawn = sample(experiment, rows, workers=workers)
-    return Sampled(drawn, groups_alike(network, links, kinds, permutations))
+    return Sampled(drawn, groups)
+
+
+def _optimum(
+    system: System, links: LinkRows, how: Settings, groups: tuple[tuple[int, ...], ...], errors: bool
+) -> Sampled:
+    """Sample the optimum by Boolean products: nearly every history of many agents has a value of its own."""
+    n, d, steps, rows = system.agents, system.dimension, system.steps, len(links.link)
+    entries = how.runs * rows * steps * n * d**2
+    if entries > MOST_ENTRIES:
+        raise UsageError(
+            f"runs: {how.runs} runs for {rows} link probabilities, {steps} steps and {n} agents of {d} states are "
+            f"{entries:.3g} entries of covariances; expected at most {MOST_ENTRIES:.3g}"
+        )
+    found = sample_optimum(system, links, how.runs, how.seed, workers=how.workers)
+    P = found.P.reshape(-1, d, d)
+    values = Moments(P)
+    if errors:
+        bias = np.zeros((len(P), d, 1)) if found.bias is None else found.bias.reshape(-1, d, 1)
+        values = Moments(P, P, bias, P + bias @ np.swapaxes(bias, -1, -2))
+    which = np.arange(len(P), dtype=np.int32).reshape(found.P.shape[:4])
+    return Sampled(Sample(values, which), groups)
 
 
 def _made(

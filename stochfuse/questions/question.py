@@ -5,7 +5,7 @@ Smaller is better in all of them: of a bias, which has a sign, the size is meant
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import isfinite
 from numbers import Real
@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from stochfuse.engines.contact_chain import MOST_UNLIKE
 from stochfuse.errors import UsageError
 from stochfuse.kalman.metrics import Metric, metric
 from stochfuse.prediction.predict import choose
@@ -52,12 +53,16 @@ class Question:
     def predict(self, link: Any) -> Prediction:
         """Return the prediction at some links."""
         more = {"steady": True} if self.step is None else {}
-        return predict_(self.scenario, link, self.method, self.quantity, **more, **self.settings)
+        found = predict_(self.scenario, link, self.method, self.quantity, **more, **self.settings)
+        _not_sampled([found])
+        return found
 
     def sweep(self, link: Any, over: Over) -> Swept:
         """Return the predictions of what was swept at some links."""
         more = {"steady": True} if self.step is None else {}
-        return predict_(self.scenario, link, self.method, self.quantity, over=over, **more, **self.settings)
+        found = predict_(self.scenario, link, self.method, self.quantity, over=over, **more, **self.settings)
+        _not_sampled(found.parts)
+        return found
 
     def read(self, prediction: Prediction, agent: int | str | None = None) -> np.ndarray:
         """Return the number asked for in every row of a prediction, shape (links,)."""
@@ -85,6 +90,15 @@ class Question:
     def monotone(self) -> bool:
         """Whether the number is proved never to rise with µ, nor with the number of agents."""
         return (self.method, self.quantity) in MONOTONE
+
+
+def _not_sampled(predictions: Sequence[Prediction]) -> None:
+    """Raise UsageError where the optimum of many unlike agents is sampled."""
+    if any(p.sampled is not None for p in predictions):
+        raise UsageError(
+            "method optimal: the optimum of so many unlike agents or links is sampled, and what is asked backwards of "
+            f"it would follow the sample's errors: expected at most {MOST_UNLIKE} agents, or like ones with equal links"
+        )
 
 
 def question(

@@ -330,7 +330,7 @@ def _fill(
             for place, step in np.argwhere(~np.isfinite(values)):
                 reason = f"{quantity} {m.label} at step {step + 1} is not finite: it grows beyond floating point"
                 group.errors.setdefault(int(items[place]), reason)
-            if p.sampled is not None:
+            if p.sampled is not None and name + ERROR in plan.columns:
                 error = p.standard_error(m, plan.agent)
                 if error is not None:
                     group.values[items, :, plan.columns.index(name + ERROR)] = error[rows]

@@ -11,7 +11,7 @@ import pytest
 import stochfuse as sf
 from stochfuse.engines import contact_chain, enclosure
 from stochfuse.engines.contact_chain import number_of_paths
-from stochfuse.scenario.network import Network
+from stochfuse.scenario.network import Network, default_rows
 from tests.agreement.test_accuracy import CASES
 from tests.oracles import strategies, textbook
 
@@ -280,8 +280,9 @@ def test_an_order_that_the_thesis_left_open():
 
 def test_what_the_chain_does_not_take():
     source = strategies.mapping(1, 25, 1, 100, 100, 13, 2, link=0.5) | {"agent": [{"R": 1}] + [{}] * 12}
+    network, kinds = sf.Scenario.from_mapping(source).network, [0] + [1] * 12
     with pytest.raises(sf.UsageError, match="takes at most 12 agents where they or their links differ, got 13"):
-        sf.predict(sf.Scenario.from_mapping(source), method="optimal")
+        contact_chain.contacts(network, default_rows(network), kinds, [(i,) for i in range(13)])
     with pytest.raises(sf.UsageError, match="takes at most 500 agents, got 501"):
         sf.predict(sf.load_scenario(agents=501), [0.5], method="optimal")
     source = strategies.mapping(1, 25, 1, 100, 100, 8, 9, burst=BURST)

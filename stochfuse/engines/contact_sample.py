@@ -1,0 +1,513 @@
+"""The optimum of sampled outcomes, many at a time: any network, hundreds of agents.
+
+In one outcome of which messages arrive the best that any linear fusion can do is one filter over all measurements whose
+data came through.  With A_k the arrivals of step k, n×n zeros and ones (row: receiver, own entry 1), the sets of agents
+whose step-t data the agents hold after step k are the rows of S_t(k),
+
+    S_t(t) = A_t M_t      S_t(k) = A_k S_t(k−1)      (Boolean products; M_t: who measured at t, on the diagonal)
+
+and the filter of agent i runs along its own sets, J_j = H_jᵀR_j⁻¹H_j of step t,
+
+    P_1 = P(k0)/|S_1|        P_t = (I + P⁻J)⁻¹P⁻    P⁻ = F P_{t−1} Fᵀ + Q    J = Σ_{j∈S_t} J_j    t = 2 … k
+    b_t = (I + P⁻J)⁻¹F b_{t−1}
+
+A message sent at step s that arrives at k brings the rows that its sender had before its exchange at s.
+
+What makes it fast.  Sets are rows of bits, 64 agents a word, so that a product is one OR for each arrival.  Steps whose
+data everybody holds drop out of the products.  At every step an agent's filter is run again only from the first t on
+whose set has grown.  Runs are followed in blocks that fit in memory, and blocks by processes; neither changes a number.
+
+Random numbers.  Up to `MOST_PAIRED` agents they are those of `stochfuse.engines.monte_carlo`: the same arrivals as of
+any other estimator.  Beyond, every run has a stream of its own and probabilities are rounded to multiples of 2⁻³².
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from stochfuse.engines.contact_chain import AlongPath, LosslessFilter
+from stochfuse.engines.events import Event, events
+from stochfuse.engines.monte_carlo import BLOCK, draw_fates, quietly, stopped_together, stream
+from stochfuse.engines.precision import suspects
+from stochfuse.engines.progress import listener
+from stochfuse.kalman.kernel import Estimate, from_factor, taken_in
+from stochfuse.scenario.network import LinkRows
+from stochfuse.scenario.system import Noises, System
+
+MOST_PAIRED = 60
+"""Agents up to which the arrivals are those of other estimators."""
+MOST_BYTES = 1 << 25
+"""Memory that a block of runs takes at a time, about."""
+MOST_COUNTED = 8
+"""Kinds of sensors up to which the members of a set are counted by kind; beyond, their information is added up."""
+MANY = 20_000_000
+"""Events drawn, over all rows, from which on another process pays for its start."""
+UNPACKED = 4096
+"""Sets whose members are unpacked at a time."""
+WORD = 64
+
+
+class OptimumSample(NamedTuple):
+    """The optimum of every sampled outcome.
+
+    Parameters
+    ----------
+    P : (rows, runs, steps, agents, d, d) covariance, what the optimum claims and what it achieves.
+    bias : (rows, runs, steps, agents, d, 1) what is left of the system's known initial error; None if there is none.
+    """
+
+    P: np.ndarray
+    bias: np.ndarray | None
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Mean covariance, (rows, steps, agents, d, d)."""
+        return self.P.mean(axis=1)
+
+    @property
+    def standard_error(self) -> np.ndarray:
+        """Standard error of every entry of the mean, (rows, steps, agents, d, d)."""
+        return self.P.std(axis=1, ddof=1) / np.sqrt(self.P.shape[1])
+
+
+def sample_optimum(
+    system: System,
+    links: LinkRows,
+    runs: int,
+    seed: int,
+    *,
+    workers: int | None = None,
+    most_bytes: int = MOST_BYTES,
+) -> OptimumSample:
+    """Draw outcomes and follow the optimum in each.
+
+    Parameters
+    ----------
+    links : rows of link probabilities, `runs` outcomes for each.
+    runs, seed : size of the sample per row, and its seed; more runs of a seed begin with the fewer.
+    workers : processes that share the work; default: one for small samples, else one per processor.
+    most_bytes : memory that a block of runs may take; the sample does not depend on it.
+
+    Notes
+    -----
+    The system's agents track one state, with independent noises: see `stochfuse.scenario.capabilities`.
+    """
+    d, n, K, rows = system.dimension, system.agents, system.steps, len(links.link)
+    P = np.empty((rows, runs, K, n, d, d))
+    bias = None if system.error is None else np.empty((rows, runs, K, n, d, 1))
+    drawn = _drawn(system, links)
+    size = max(1, most_bytes // _bytes_of_a_run(system, max(map(len, drawn))))
+    source, stride = (_paired, BLOCK) if n <= MOST_PAIRED else (_own, size)
+    blocks = [(row, range(first, min(first + stride, runs))) for row in range(rows) for first in range(0, runs, stride)]
+    work = _Work(_Outcomes(system, drawn, seed), _Riccati(system), source, size)
+    if workers is None:
+        workers = len(os.sched_getaffinity(0)) if rows * runs * sum(map(len, drawn)) >= MANY else 1
+    for done, (row, first, now, left) in enumerate(_all_followed(work, blocks, min(workers, len(blocks))), start=1):
+        P[row, first : first + len(now)] = now
+        if bias is not None:
+            bias[row, first : first + len(now)] = left
+        listener().advance("sampling", done, len(blocks))
+    return OptimumSample(P, bias)
+
+
+class _Work(NamedTuple):
+    """What a process needs to follow blocks of runs, so many runs at a time."""
+
+    outcomes: _Outcomes
+    riccati: _Riccati
+    source: Callable[[_Outcomes, int, range, int], Iterator[tuple[range, Iterator[_Arrivals]]]]
+    size: int
+
+    def follow(self, block: tuple[int, range]) -> tuple[int, int, np.ndarray, np.ndarray | None]:
+        """Row and first run of a block, covariances (runs, steps, agents, d, d) and biases (…, d, 1)."""
+        row, runs = block
+        system = self.outcomes.system
+        P = np.empty((len(runs), system.steps, system.agents, system.dimension, system.dimension))
+        bias = None if system.error is None else np.empty((*P.shape[:-1], 1))
+        for some, fates in self.source(self.outcomes, row, runs, self.size):
+            part = slice(some.start - runs.start, some.stop - runs.start)
+            for k, (now, left) in enumerate(_followed(self.riccati, fates, len(some), system.agents)):
+                P[part, k] = now
+                if bias is not None:
+                    bias[part, k] = left
+        return row, runs.start, P, bias
+
+
+def _all_followed(work: _Work, blocks: Sequence[tuple[int, range]], workers: int) -> Iterator[Any]:
+    """Every block followed, in order: by processes that share them, or here."""
+    if workers == 1:
+        yield from map(work.follow, blocks)
+        return
+    with ProcessPoolExecutor(workers, initializer=_begin, initargs=(work,)) as pool, stopped_together():
+        yield from pool.map(_follow, blocks)
+
+
+_shared: list[_Work] = []
+"""What a process that follows blocks was started with: too large to be sent with every block."""
+
+
+def _begin(work: _Work) -> None:
+    quietly()
+    _shared[:] = [work]
+
+
+def _follow(block: tuple[int, range]) -> Any:
+    return _shared[0].follow(block)
+
+
+def _drawn(system: System, links: LinkRows) -> list[list[Event]]:
+    """Events of every step; beyond `MOST_PAIRED` agents without those that words of 32 bits never let come about."""
+    n, K = system.agents, system.steps
+    drawn = [events(system.network, links, step) for step in range(1, K + 1 if links.varies else 2)]
+    if n > MOST_PAIRED:
+        drawn = [_possible(now) for now in drawn]
+    return drawn if links.varies else drawn * K
+
+
+def _possible(drawn: list[Event]) -> list[Event]:
+    thresholds = _threshold(np.array([event.probability for event in drawn]))
+    ever = set(np.nonzero(thresholds)[0].tolist())
+    return [event for number, event in enumerate(drawn) if number in ever or event.burst is not None]
+
+
+def _bytes_of_a_run(system: System, drawn: int) -> int:
+    n, K, d = system.agents, system.steps, system.dimension
+    sets = 8 * K * (-(-n // WORD)) * (2 + len(system.network.delay))
+    return n * (sets + 8 * K * (d * d + d) + 40 * d * d) + 8 * drawn
+
+
+# what becomes of messages and measurements
+
+
+class _Arrivals(NamedTuple):
+    """Messages of a step by what became of them, and what is measured at it.
+
+    Parameters
+    ----------
+    arrived : for every delay 0, 1 … the (run and receiver, run and sender) pairs, numbered run·n + agent, by receiver.
+    missed : (runs, agents) whose sensors miss, or None if nobody's.
+    """
+
+    arrived: list[tuple[np.ndarray, np.ndarray]]
+    missed: np.ndarray | None
+
+
+class _Links:
+    """Events of a step as arrays: who hears whom in which, and for streams of words the thresholds of one row."""
+
+    def __init__(self, drawn: Sequence[Event], agents: int) -> None:
+        each = sorted((i, e.sender, number) for number, e in enumerate(drawn) for i in e.receivers)
+        self.agents, self.delays = agents, max((len(event.delay) for event in drawn), default=1)
+        self.receiver, self.sender, number = np.array(each, dtype=np.intp).reshape(-1, 3).T
+        self.event = None if np.array_equal(number, range(len(drawn))) else number
+
+    def arrived(self, fates: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Pairs of what arrived after each delay, from fates (runs, events), 0 lost, 1 + delay otherwise."""
+        fates = fates if self.event is None else fates[:, self.event]
+        found = []
+        for delay in range(self.delays):
+            run, pair = np.divmod(np.flatnonzero(fates == 1 + delay), max(1, fates.shape[1]))
+            run *= self.agents
+            found.append((run + self.receiver[pair], run + self.sender[pair]))
+        return found
+
+
+class _Outcomes:
+    """What outcomes are drawn from."""
+
+    def __init__(self, system: System, drawn: Sequence[list[Event]], seed: int) -> None:
+        self.system, self.drawn, self.seed = system, drawn, seed
+        self.detections = [system.detections(step) for step in range(1, system.steps + 1)]
+        different = {id(now): now for now in drawn}
+        links = {key: _Links(now, system.agents) for key, now in different.items()}
+        self.links = [links[id(now)] for now in drawn]
+
+
+def _paired(given: _Outcomes, row: int, block: range, size: int) -> Iterator[tuple[range, Iterator[_Arrivals]]]:
+    """Some runs at a time of a block, with what becomes of each step, as `monte_carlo` draws it."""
+    random = stream(given.seed, row, block.start // BLOCK)
+    fates, missed = draw_fates(random, given.drawn, given.detections, (len(block), given.system.agents), row)
+    for first in range(0, len(block), size):
+        some = slice(first, first + size)
+
+        def steps(some: slice = some) -> Iterator[_Arrivals]:
+            for links, fate, lost in zip(given.links, fates, missed, strict=True):
+                yield _Arrivals(links.arrived(fate[some]), lost[some].astype(bool) if lost.any() else None)
+
+        yield block[some], steps()
+
+
+def _own(given: _Outcomes, row: int, block: range, size: int) -> Iterator[tuple[range, Iterator[_Arrivals]]]:
+    """All runs of a block, with what becomes of each step, every run from a stream of its own."""
+    yield block, _words_followed(given, row, [stream(given.seed, row, run) for run in block])
+
+
+def _words_followed(given: _Outcomes, row: int, streams: Sequence[np.random.Generator]) -> Iterator[_Arrivals]:
+    chances: dict[int, _Chances] = {}
+    bad = None
+    for drawn, links, detections in zip(given.drawn, given.links, given.detections, strict=True):
+        if id(drawn) not in chances:
+            chances = {id(drawn): _Chances(drawn, row)}
+        now, missed = chances[id(drawn)], None
+        if detections:
+            agents, p = np.array(detections).T
+            missed = np.zeros((len(streams), given.system.agents), dtype=bool)
+            missed[:, agents.astype(int)] = ~_below(_words(streams, len(agents)), _threshold(p))
+        arrival = now.arrival
+        if now.burst is not None:
+            bad = now.burst.next(bad, _words(streams, len(drawn)))
+            arrival = np.where(bad, now.burst.bad, now.burst.good)
+        fates = _below(_words(streams, len(drawn)), arrival).view(np.uint8)
+        if now.late:
+            words = _words(streams, len(drawn))
+            late = np.array([~_below(words, upto) for upto in now.late]).sum(axis=0, dtype=np.uint8)
+            fates = fates * (late + np.uint8(1))
+        yield _Arrivals(links.arrived(fates), missed)
+
+
+class _Burst(NamedTuple):
+    """Thresholds of bursty links: to be bad at first, to turn bad, to stay bad, and to deliver when good and bad."""
+
+    first: np.ndarray
+    turn: np.ndarray
+    stay: np.ndarray
+    good: np.ndarray
+    bad: np.ndarray
+
+    def next(self, bad: np.ndarray | None, words: np.ndarray) -> np.ndarray:
+        """Whether links are bad, from whether they were; None before the first step."""
+        return _below(words, self.first if bad is None else np.where(bad, self.stay, self.turn))
+
+
+class _Chances:
+    """Thresholds of a row for the words of a step's events."""
+
+    def __init__(self, drawn: Sequence[Event], row: int) -> None:
+        self.arrival = _threshold(np.array([event.probability[row] for event in drawn]))
+        self.burst, self.late = None, []
+        if any(event.burst is not None for event in drawn):
+            to_bad, to_good, good, bad = np.array([e.burst[row] for e in drawn if e.burst is not None]).T
+            self.burst = _Burst(*map(_threshold, (to_bad / (to_bad + to_good), to_bad, 1.0 - to_good, good, bad)))
+        longest = max((len(event.delay) for event in drawn), default=1)
+        if longest > 1:
+            upto = np.array([np.cumsum([*e.delay, *(0.0,) * (longest - len(e.delay))]) for e in drawn])
+            last = np.array([len(e.delay) for e in drawn])[:, None] <= np.arange(1, longest + 1)
+            self.late = [_threshold(column) for column in np.where(last, 1.0, upto).T[:-1]]
+
+
+def _words(streams: Sequence[np.random.Generator], count: int) -> np.ndarray:
+    """Random words of 32 bits, (streams, count)."""
+    out = np.empty((len(streams), -(-count // 2)), dtype=np.uint64)
+    for words, each in zip(out, streams, strict=True):
+        words[:] = each.bit_generator.random_raw(len(words))
+    return out.view(np.uint32)[:, :count]
+
+
+def _threshold(p: np.ndarray) -> np.ndarray:
+    """Number of words of 32 bits, of all 2³², that stand for a probability."""
+    return np.rint(np.asarray(p) * 2.0**32).astype(np.uint64)
+
+
+def _below(words: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
+    """Whether what has a probability comes about: 2³² is no word, so that certain is certain."""
+    certain = thresholds >> 32 != 0
+    small = words < thresholds.astype(np.uint32)
+    return small | certain if certain.any() else small
+
+
+# whose measurements are held
+
+
+def _followed(
+    riccati: _Riccati, steps: Iterator[_Arrivals], runs: int, agents: int
+) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
+    """Covariance (runs, agents, d, d) and bias (runs, agents, d, 1) after every step.
+
+    The sets of the steps from `low` on, the first whose data not everybody holds, are rows of words
+    (runs·agents, steps, words); what they were before an exchange is kept as long as messages are under way.
+    """
+    own = _own_bits(agents)
+    sets, low = np.zeros((runs * agents, 0, own.shape[1]), dtype=np.uint64), 0
+    most: list[np.ndarray] = []
+    before: list[tuple[int, np.ndarray]] = []
+    schedule: list[list[tuple[np.ndarray, np.ndarray]]] = []
+    filters = riccati.blank(runs * agents)
+    for k, step in enumerate(steps):
+        new = np.tile(own, (runs, 1))
+        if step.missed is not None:
+            new[step.missed.ravel()] = 0
+        most.append(np.bitwise_or.reduce(new.reshape(runs, agents, -1), axis=1))
+        held = np.concatenate([sets, new[:, None]], axis=1)
+        before.append((low, held))
+        schedule.append(step.arrived)
+        sets = held.copy()
+        for delay in range(min(k + 1, max(map(len, schedule)))):
+            if delay < len(schedule[k - delay]):
+                _joined(sets, low, before[k - delay], schedule[k - delay][delay])
+        grown = _in_any_word(sets[:, :-1] != held[:, :-1])
+        first = np.where(grown.any(axis=1), grown.argmax(axis=1) if grown.shape[1] else 0, k - low)
+        yield riccati.after(filters, sets, low, first, (runs, agents))
+        while sets.shape[1] and (sets[:, 0].reshape(runs, agents, -1) == most[low][:, None]).all():
+            sets, low = sets[:, 1:], low + 1
+        _forget(before, schedule, k)
+
+
+def _in_any_word(words: np.ndarray) -> np.ndarray:
+    """Whether any of the words on the last axis is true: few words, so that one after the other is fastest."""
+    return np.logical_or.reduce([words[..., word] for word in range(words.shape[-1])])
+
+
+def _members(sets: np.ndarray) -> np.ndarray:
+    """Numbers of members of sets (..., words)."""
+    total = np.zeros(sets.shape[:-1])
+    for word in range(sets.shape[-1]):
+        total += np.bitwise_count(sets[..., word])
+    return total
+
+
+def _own_bits(agents: int) -> np.ndarray:
+    """Row of words of every agent that has its own bit alone, (agents, words)."""
+    i = np.arange(agents)
+    bits = np.zeros((agents, -(-agents // WORD)), dtype=np.uint64)
+    bits[i, i // WORD] = np.uint64(1) << (i % WORD).astype(np.uint64)
+    return bits
+
+
+def _forget(before: list, schedule: list, k: int) -> None:
+    """Let go of what no message under way brings any more."""
+    longest = max(map(len, schedule))
+    if k + 1 >= longest:
+        gone = k + 1 - longest
+        before[gone] = (0, np.empty((0, 0, 0), dtype=np.uint64))
+        schedule[gone] = []
+
+
+def _joined(sets: np.ndarray, low: int, sent: tuple[int, np.ndarray], pairs: tuple[np.ndarray, np.ndarray]) -> None:
+    """Let receivers hold, in place, what senders held when they sent."""
+    since, held = sent
+    held = held[:, low - since :]
+    receiver, sender = pairs
+    if not held.shape[1] or not len(receiver):
+        return
+    starts = np.flatnonzero(np.diff(receiver, prepend=-1))
+    number = np.diff(starts, append=len(receiver))
+    # those that hear most come first: all that are left at every round are then the first so many
+    order = np.argsort(-number, kind="stable")
+    starts, rounds = starts[order], np.cumsum(np.bincount(number)[::-1])[::-1]
+    flat = np.ascontiguousarray(held).reshape(len(held), -1)
+    brought = flat.take(sender[starts], axis=0)
+    for heard in range(1, len(rounds) - 1):
+        brought[: rounds[heard + 1]] |= flat.take(sender[starts[: rounds[heard + 1]] + heard], axis=0)
+    sets[receiver[starts], : held.shape[1]] |= brought.reshape(-1, *held.shape[1:])
+
+
+# the filter along them
+
+
+class _Kept(NamedTuple):
+    """Filters after every step t, (steps, d, d, items); what is left of the known initial error, (steps, d, items)."""
+
+    P: np.ndarray
+    x: np.ndarray | None
+
+
+class _Riccati:
+    """The filter of an agent along its sets."""
+
+    def __init__(self, system: System) -> None:
+        self.system = system
+        kinds, self.agents = np.array(system.sensor_of), system.agents
+        J = [[s.H[t].T @ np.linalg.solve(s.R[t], s.H[t]) for s in system.sensors] for t in range(system.steps)]
+        self.J = np.array(J)
+        bits = _own_bits(system.agents)
+        self.of_kind = np.array(
+            [np.bitwise_or.reduce(bits[kinds == kind], axis=0) for kind in range(len(system.sensors))]
+        )
+        self.counted = len(system.sensors) <= MOST_COUNTED
+        if not self.counted:
+            self.J = self.J[:, kinds]
+        self.lossless = LosslessFilter(system.model, system.sensors, system.P0, system.shared, system.error)
+        self.precise = bool(suspects(system, Noises(P0=system.P0[None])).any())
+
+    def blank(self, items: int) -> _Kept:
+        """Room for the filters of so many agents."""
+        d, K = self.system.dimension, self.system.steps
+        return _Kept(np.empty((K, d, d, items)), None if self.system.error is None else np.empty((K, d, items)))
+
+    def after(
+        self, kept: _Kept, sets: np.ndarray, low: int, first: np.ndarray, shape: tuple[int, int]
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """Filters after a step, run again, in place, from the first set on that has grown.
+
+        Parameters
+        ----------
+        sets : (items, steps, words) of the steps after `low` ones.
+        first : (items,) place of the first of them that has grown.
+        """
+        for place in range(first.min(), sets.shape[1]):
+            some = np.flatnonzero(first <= place)
+            some = slice(None) if len(some) == len(first) else some
+            self._advance(kept, some, sets[some, place], low + place)
+        P, x = kept.P[low + sets.shape[1] - 1], None if kept.x is None else kept.x[low + sets.shape[1] - 1]
+        d = len(P)
+        P = np.moveaxis(P.reshape(d, d, *shape), (0, 1), (-2, -1))
+        P = from_factor(P) if self._roots else P
+        return P, None if x is None else np.moveaxis(x.reshape(d, 1, *shape), (0, 1), (-2, -1))
+
+    def _advance(self, kept: _Kept, some: np.ndarray | slice, held: np.ndarray, t: int) -> None:
+        """Filters of some items after step t + 1, from those after t, with the measurements of the agents held."""
+        x, P = kept.x, kept.P
+        if t == 0:
+            start = self._start(_members(held))
+        else:
+            before = Estimate(None if x is None else x[t - 1][:, some], P[t - 1][..., some])
+            start = self._in_roots(before, held, t) if self.precise else self._in_information(before, held, t)
+        P[t][..., some] = start.P
+        if x is not None:
+            x[t][:, some] = start.x
+
+    def _start(self, number: np.ndarray) -> Estimate:
+        """First estimates, each from those of so many agents."""
+        given = self.lossless
+        P0 = given.numbers.factor(given.P0) if self._roots else given.P0
+        number = np.ones_like(number) if given.shared else np.sqrt(number) if self._roots else number
+        return Estimate(given.error, P0[..., None] / number)
+
+    def _in_information(self, before: Estimate, held: np.ndarray, t: int) -> Estimate:
+        F, Q, d = self.system.model.F[t], self.system.model.Q[t], self.system.dimension
+        prior = (np.kron(F, F) @ before.P.reshape(d * d, -1)).reshape(before.P.shape) + Q[..., None]
+        P, x = taken_in(prior, self._information(held, t), None if before.x is None else F @ before.x)
+        return Estimate(x, P)
+
+    def _in_roots(self, before: Estimate, held: np.ndarray, t: int) -> Estimate:
+        x = None if before.x is None else before.x.T[..., None]
+        counts = np.moveaxis(self._counts(held), 0, -1)
+        found = self.lossless.after(AlongPath(x, np.moveaxis(before.P, -1, 0)), counts, t + 1)
+        return Estimate(None if x is None else found.x[..., 0].T, np.moveaxis(found.root, 0, -1))
+
+    @property
+    def _roots(self) -> bool:
+        """Whether square roots are kept in the place of covariances."""
+        return self.precise and not self.lossless.scalar
+
+    def _counts(self, held: np.ndarray) -> np.ndarray:
+        """How many members of sets are of each kind, (kinds, items)."""
+        return np.array([_members(held & mask) for mask in self.of_kind])
+
+    def _information(self, held: np.ndarray, t: int) -> np.ndarray:
+        """Σ of J_j over sets of agents, (d, d, items)."""
+        J = self.J[t]
+        flat = J.reshape(len(J), -1).T
+        if self.counted:
+            return (flat @ self._counts(held)).reshape(*J.shape[1:], -1)
+        out = np.empty((len(flat), len(held)))
+        for first in range(0, len(held), UNPACKED):
+            words = np.ascontiguousarray(held[first : first + UNPACKED]).astype("<u8").view(np.uint8)
+            members = np.unpackbits(words, axis=-1, bitorder="little")[:, : self.agents]
+            out[:, first : first + UNPACKED] = flat @ members.T.astype(float)
+        return out.reshape(*J.shape[1:], -1)
