@@ -121,8 +121,8 @@ class Trace(NamedTuple):
     estimator : its name.
     x, variance : (steps, agents, d) estimates of the first run, and claimed variances.
     truth : (steps, agents, d) of the first run, NaN where unknown.
-    nees : (steps,) average over runs and agents; NaN where unknown.
-    band : (steps, 2) between what it lies if the claim is consistent.
+    nees, nis : (steps,) averages over runs and agents; NaN where unknown.
+    band, nis_band : (steps, 2) between what they lie if the claim is consistent.
     """
 
     estimator: str
@@ -131,6 +131,8 @@ class Trace(NamedTuple):
     truth: np.ndarray
     nees: np.ndarray
     band: np.ndarray
+    nis: np.ndarray
+    nis_band: np.ndarray
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -489,14 +491,16 @@ class Tally:
     def trace(self) -> Trace:
         """Over the steps."""
         x, variance = np.stack(self._shown, axis=1)
-        count = self.nees.count.sum(axis=1)
-        d = float(self.nees.freedom[0])
-        # agents that fuse with each other count as one
-        runs = self.nees.count.max(axis=1)
-        bands = {number: band(d, number) for number in set(runs.tolist()) if number}
-        ends = np.array([bands.get(number, (np.nan, np.nan)) for number in runs.tolist()])
-        nees = np.where(count > 0, self.nees.by_step(), np.nan)
-        return Trace(self.estimator, x, variance, self._truth, nees, ends)
+        nees, nis = _over_steps(self.nees), _over_steps(self.nis)
+        return Trace(self.estimator, x, variance, self._truth, *nees, *nis)
+
+
+def _over_steps(series: Series) -> tuple[np.ndarray, np.ndarray]:
+    """Averages of every step, and their bands; agents that fuse with each other count as one."""
+    runs, freedom = series.count.max(axis=1), float(series.freedom.mean())
+    bands = {number: band(freedom, number) for number in set(runs.tolist()) if number}
+    ends = np.array([bands.get(number, (np.nan, np.nan)) for number in runs.tolist()])
+    return series.by_step(), ends
 
 
 def _normalised(error: np.ndarray, P: np.ndarray) -> np.ndarray:

@@ -320,7 +320,8 @@ def predict_many(
         return np.where(without.reshape(-1, *(1,) * (M.ndim - 1)), np.nan, M)
 
     moments = prediction.moments.map(blank) if found.faults else prediction.moments
-    return replace(prediction, moments=moments, meta={**prediction.meta, "faults": dict(found.faults)})
+    meta = {**prediction.meta, "faults": dict(found.faults)}
+    return replace(prediction, moments=moments, meta=meta, noises=items.noises)
 
 
 def predict_items(

@@ -15,6 +15,7 @@ from stochfuse.prediction.quantities import linear, matrix, number, value
 from stochfuse.scenario.registry import BROADCAST_PRIOR
 from stochfuse.scenario.result import Result
 from stochfuse.scenario.scenario import Scenario
+from stochfuse.scenario.system import Noises
 
 if TYPE_CHECKING:
     from stochfuse.prediction.general import Outcomes
@@ -46,6 +47,7 @@ class Prediction(Result):
     meta : further facts for programs.
     steady : (links, groups, d, d) steady-state covariance if it was asked for.
     steady_bound : (links, groups) proved relative error bound of `steady`.
+    noises : of each item, where items have noises of their own.
     supported : link probabilities that the log supports and the prediction of them, if an interval was asked for.
     """
 
@@ -68,6 +70,7 @@ class Prediction(Result):
     steady: np.ndarray | None = None
     steady_bound: np.ndarray | None = field(default=None, repr=False)
     supported: tuple[Posterior, Prediction] | None = field(default=None, repr=False)
+    noises: Noises | None = field(default=None, repr=False)
 
     @property
     def by_group(self) -> np.ndarray:

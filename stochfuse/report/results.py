@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 from typing import Any
 
+import numpy as np
+
 from stochfuse.data.crosscheck import Verdict
 from stochfuse.data.run import RunResult
 from stochfuse.errors import UsageError, needed
@@ -145,7 +147,20 @@ def frame_of(result: Any, **shown: Any) -> Any:
         frame = frame.rename(columns={key.title: key.name for key in over.keys})
     if isinstance(result, Prediction) and "faults" in result.meta:
         frame.insert(0, "item", [item for item in range(len(result.link)) for _ in result.steps])
+        for name, column in _noise_columns(result).items():
+            frame[name] = column[frame["item"]]
     return frame
+
+
+def _noise_columns(p: Prediction) -> dict[str, np.ndarray]:
+    """Noises of items that have their own: Q, R, P, or their entries Q[1,2], the upper half of each matrix."""
+    out = {}
+    for name, M in zip(("Q", "R", "P"), p.noises or (), strict=False):
+        if M is not None:
+            d = M.shape[-1]
+            upper = [(i, j) for i in range(d) for j in range(i, d)]
+            out |= {name if d == 1 else f"{name}[{i + 1},{j + 1}]": M[:, i, j] for i, j in upper}
+    return out
 
 
 def arrays_of(result: Any) -> Any:

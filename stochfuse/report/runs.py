@@ -152,13 +152,17 @@ def run_json(found: RunResult) -> dict[str, Any]:
 
 
 def draw(found: RunResult) -> Any:
-    """Return the figure: error and ±2σ of every agent over the steps, below it what arrived, and NEES with its band."""
+    """Return the figure: error and ±2σ of every agent over the steps, below it what arrived, and NEES with its band.
+
+    Without a truth: estimates in the place of errors, and NIS in that of NEES.
+    """
     n = found.scenario.network.agents
     agents = range(min(n, MOST_AGENTS))
     columns = min(len(agents), 3)
     rows = -(-len(agents) // columns)
-    nees = any(not np.isnan(trace.nees).all() for trace in found.traces)
-    heights = [3.0, 1.0] * rows + ([2.2] if nees else [])
+    known = any(not np.isnan(trace.nees).all() for trace in found.traces)
+    checked = known or any(not np.isnan(trace.nis).all() for trace in found.traces)
+    heights = [3.0, 1.0] * rows + ([2.2] if checked else [])
     figure = figure_class()(figsize=(4.2 * columns + 0.6, 0.95 * sum(heights) + 1.6), layout="constrained")
     grid = figure.add_gridspec(len(heights), columns, height_ratios=heights)
     handles: list[Any] = []
@@ -168,11 +172,12 @@ def draw(found: RunResult) -> Any:
         lines = _errors(above, found, agent)
         handles = handles or lines
         _arrived(figure.add_subplot(grid[row + 1, column], sharex=above), found, agent)
-    if nees:
-        _nees(figure.add_subplot(grid[len(heights) - 1, :]), found)
+    if checked:
+        _averages(figure.add_subplot(grid[len(heights) - 1, :]), found, "NEES" if known else "NIS")
     below(figure, handles)
     what = f"of the first of {found.runs:,} runs" if found.runs > 1 else "of the run"
-    titled(figure, *_titles(found)[:2], f"errors and ±2σ (grey: {found.traces[0].estimator}) {what}")
+    shown = "errors" if known else "estimates, since the truth is not known,"
+    titled(figure, *_titles(found)[:2], f"{shown} and ±2σ (grey: {found.traces[0].estimator}) {what}")
     return figure
 
 
@@ -222,19 +227,20 @@ def _arrived(axes: Any, found: RunResult, agent: int) -> None:
     axes.xaxis.get_major_locator().set_params(integer=True)
 
 
-def _nees(axes: Any, found: RunResult) -> None:
-    """Averages over runs and agents, with what they keep if the agents of a run are one."""
+def _averages(axes: Any, found: RunResult, name: str) -> None:
+    """Averages of NEES or NIS over runs and agents, with what they keep if the agents of a run are one."""
     k = np.arange(1, found.scenario.network.steps + 1)
-    for place, trace in enumerate(found.traces):
+    each = [(trace.nees, trace.band) if name == "NEES" else (trace.nis, trace.nis_band) for trace in found.traces]
+    for place, (average, band) in enumerate(each):
         style = {"color": COLORS[place % len(COLORS)], "linestyle": DASHES[place % len(DASHES)]}
-        axes.plot(k, trace.nees, linewidth=1.3, **style)
+        there = ~np.isnan(average)
+        axes.plot(k[there], average[there], linewidth=1.3, **style)
         if place == 0:
-            axes.fill_between(k, *trace.band.T, color="0.85", linewidth=0)
-    top = max(float(np.nanmax(trace.nees)) for trace in found.traces)
-    if top > 20.0 * float(np.nanmax(found.traces[0].band)):
+            axes.fill_between(k[there], *band[there].T, color="0.85", linewidth=0)
+    if max(float(np.nanmax(average)) for average, _ in each) > 20.0 * float(np.nanmax(each[0][1])):
         axes.set_yscale("log")
     axes.set_xlabel("step k")
     axes.xaxis.get_major_locator().set_params(integer=True)
-    axes.set_ylabel("NEES")
+    axes.set_ylabel(name)
     axes.grid(alpha=0.3)
-    axes.set_title("NEES, mean over runs and agents (grey: where 95 % of consistent filters' lie)", fontsize="small")
+    axes.set_title(f"{name}, mean over runs and agents (grey: where 95 % of consistent filters' lie)", fontsize="small")

@@ -84,6 +84,14 @@ def test_frames_hold_the_values():
     assert set(frame["unit"]) == {"m"}
 
 
+def test_many_parameter_sets_have_their_parameters_beside_them():
+    R, Q = np.array([1.0, 2.0, 3.0]), np.array([np.eye(2), [[2, 0.5], [0.5, 1]], 3 * np.eye(2)])
+    frame = sf.predict_many(MINE, link=[0.1, 0.2, 0.3], R=R, Q=Q).to_dataframe()
+    np.testing.assert_array_equal(frame["R"], R[frame["item"]])
+    np.testing.assert_array_equal(frame["Q[1,2]"], Q[:, 0, 1][frame["item"]])
+    assert "P" not in frame
+
+
 def test_many_parameter_sets_are_told_apart_and_lost_ones_stay():
     R = np.array([4.0, 0.0, 9.0])
     with pytest.raises(sf.UsageError):
