@@ -72,7 +72,7 @@ def methods_json() -> dict[str, Any]:
         "estimators": [{"name": e.name, "title": e.title, "source": e.source} for e in registry.ESTIMATOR],
         "engines": [
             {"name": e.name, "title": e.title, "source": e.source, "nature": e.nature, "help": e.help}
-            for e in (*registry.ENGINE, registry.REPLAY)
+            for e in registry.ENGINE
         ],
         "short_forms": [{"name": s.name, "estimator": s.estimator, "engine": s.engine} for s in registry.SHORT],
         "quantities": [{"name": q.name, "help": q.help} for q in registry.QUANTITY],

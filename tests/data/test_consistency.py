@@ -38,7 +38,7 @@ def test_a_band_is_a_quantile():
 def test_intervals_keep_their_promise_where_errors_last(runs):
     """Errors that stay alike for some steps, and agents that have them in common: 95 % of averages lie within."""
     rng = np.random.default_rng(7 + runs)
-    steps, inside, trials = (1500, 0, 300) if runs == 1 else (12, 0, 300)
+    steps, inside, trials = (1000, 0, 200) if runs == 1 else (12, 0, 300)
     for _ in range(trials):
         white = rng.standard_normal((runs, steps, 2))
         e = lfilter([0.6], [1.0, -0.8], white, axis=1, zi=0.8 * rng.standard_normal((runs, 1, 2)))[0]

@@ -29,7 +29,7 @@ HEARD = "run,step,receiver,sender\n1,2,1,2\n"
 def made(tmp_path_factory):
     """Three runs of a tracker in the plane, its files and what was said of them."""
     folder = tmp_path_factory.mktemp("made")
-    words = ["cv-2d", "--steps", 5, "--link", 0.5, "--runs", 3, "--seed", 4, "--estimator", "naive"]
+    words = ["cv-2d", "--steps", 3, "--link", 0.5, "--runs", 3, "--seed", 4, "--estimator", "naive"]
     command("simulate", *words, "-o", folder)
     return folder
 

@@ -49,7 +49,7 @@ def of_feature(name, feature):
     return s
 
 
-PAIRS = [(name, feature) for f, feature in enumerate(FEATURES) for e, name in enumerate(ESTIMATORS) if (e + f) % 4 == 0]
+PAIRS = [(name, feature) for f, feature in enumerate(FEATURES) for e, name in enumerate(ESTIMATORS) if (e + f) % 6 == 0]
 
 
 @pytest.mark.parametrize(("name", "feature"), PAIRS)

@@ -73,8 +73,14 @@ def test_every_outcome_is_the_textbooks(name, delay):
 FEATURES = [f.name for f in capabilities.FEATURES if f.name not in ("detection", "bursts", "cases", "many-agents")]
 
 
-@pytest.mark.parametrize("feature", FEATURES)
-@pytest.mark.parametrize("name", ESTIMATORS)
+PAIRS = [
+    pytest.param(name, feature, marks=pytest.mark.slow if (e + f) % 3 else ())
+    for f, feature in enumerate(FEATURES)
+    for e, name in enumerate(ESTIMATORS)
+]
+
+
+@pytest.mark.parametrize(("name", "feature"), PAIRS)
 def test_averaged_over_outcomes_it_is_the_enumeration(name, feature):
     """(49) of claimed and of actual covariances, for each feature of a scenario that the table says is taken."""
     if capabilities.reason(name, GENERAL, feature) is not None:

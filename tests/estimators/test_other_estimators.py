@@ -547,8 +547,6 @@ def test_estimators_that_do_not_fit():
             name,
         )
     scenario = sf.Scenario.from_mapping(COMMON)
-    with pytest.raises(sf.UsageError, match="estimator itns: its states cannot be had for a record of measurements"):
-        outcomes(scenario, link_rows(scenario), "itns", records=np.zeros((3, 3, 2)))
 
 
 def test_agents_that_measure_nothing_of_each_other_learn_nothing():
