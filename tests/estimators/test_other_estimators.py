@@ -546,7 +546,6 @@ def test_estimators_that_do_not_fit():
             r"expected sensors that measure the same \(one H\), got another H; ",
             name,
         )
-    scenario = sf.Scenario.from_mapping(COMMON)
 
 
 def test_agents_that_measure_nothing_of_each_other_learn_nothing():
