@@ -30,7 +30,7 @@ from stochfuse.errors import StochfuseError, UsageError, nearest
 from stochfuse.estimators.readings import Readings
 from stochfuse.kalman.metrics import Metric
 from stochfuse.kalman.metrics import metric as metric_of
-from stochfuse.prediction.predict import predict
+from stochfuse.prediction.predict import choose, predict
 from stochfuse.scenario import registry
 from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.result import Result
@@ -225,18 +225,8 @@ def way_of(given: Mapping[str, Any], scenario: Scenario) -> Way:
     rest.pop("estimator", None)
     names = (asked,) if isinstance(asked, str) else tuple(asked)
     for name in names:
-        if name not in registry.ESTIMATORS:
-            listed = ", ".join(registry.ESTIMATORS)
-            raise UsageError(f"estimator: expected one of {listed}, got '{name}'{nearest(name, registry.ESTIMATORS)}")
+        choose("estimator", name, registry.ESTIMATORS)
     return Way(names, **rest)
-
-
-def _check_criterion(criterion: str) -> None:
-    if criterion not in registry.CRITERIA:
-        raise UsageError(
-            f"criterion: expected one of {', '.join(registry.CRITERIA)}, got '{criterion}'"
-            f"{nearest(criterion, registry.CRITERIA)}"
-        )
 
 
 @of_scenario
@@ -306,7 +296,7 @@ def run_records(
     NoAnswerError
         If an estimator claims no covariance in some run.
     """
-    _check_criterion(way.criterion)
+    choose("criterion", way.criterion, registry.CRITERIA)
     scenario = records.scenario
     links = None
     if not records.given or way.link is not None or scenario.network.link is not None or scenario.network.cases:

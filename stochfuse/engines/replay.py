@@ -118,17 +118,12 @@ def replay(
         values, runs = np.concatenate(pairs), np.repeat(everyone, [len(each) for each in pairs])
         numbers.work(values, runs)
         numbers.keep(values, runs)
-        if written(estimator) > limit:
+        if len(estimator.book.step) > limit:
             fresh = make_for_data(system, name, criterion)
             names = given_again(estimator, fresh, (value for each in rests_on for value in each))
             states = [estimator.renamed(state, names, fresh) for state in states]
             numbers, estimator = numbers.renamed(fresh, names), fresh
-            limit = WRITTEN + written(estimator)
-
-
-def written(estimator: Any) -> int:
-    """How many values an estimator has written down."""
-    return len(estimator.pasts.step if hasattr(estimator, "pasts") else estimator.ledger.sums)
+            limit = WRITTEN + len(estimator.book.step)
 
 
 def _exchanged(

@@ -157,6 +157,11 @@ class FusionRule:
         self.ledger, self.sources, self.shared = ledger, tuple(sources), shared
         self.relabellings = relabellings or [tuple(range(len(self.sources)))]
 
+    @property
+    def book(self) -> Ledger:
+        """Where values are written down."""
+        return self.ledger
+
     def seen(self, missed: int) -> Iterator[int | None]:
         """Source of what each agent measures; None for those, a mask, whose sensor misses."""
         return (None if missed >> i & 1 else source for i, source in enumerate(self.sources))

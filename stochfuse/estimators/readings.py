@@ -479,6 +479,4 @@ class SumNumbers:
 
 def given_again(old: Any, new: Any, values: Iterator[int]) -> dict[int, int]:
     """Names, in the book of a new estimator without a past, for values of an old one that are known in numbers."""
-    if isinstance(old, RecursiveEstimator):
-        return {value: new.pasts.given(old.pasts.step[value]) for value in sorted(set(values))}
-    return {value: new.ledger.given(old.ledger.step[value]) for value in sorted(set(values))}
+    return {value: new.book.given(old.book.step[value]) for value in sorted(set(values))}

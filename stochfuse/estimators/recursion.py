@@ -102,6 +102,11 @@ class RecursiveEstimator:
         return Footprints(self.world) if self.errors else None
 
     @property
+    def book(self) -> Pasts:
+        """Where values are written down."""
+        return self.pasts
+
+    @property
     def riding(self) -> Riding | None:
         """What rides along with covariances: what was measured (`readings`), noise footprints, or nothing."""
         return self.footprints if self.readings is None else self.readings

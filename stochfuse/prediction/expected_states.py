@@ -12,26 +12,21 @@ z − h(x*) + H x*, angles wrapped.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from functools import partial
 from typing import Any
 
 import numpy as np
 
-from stochfuse.engines.events import events, relabellings
-from stochfuse.engines.monte_carlo import Experiment, sample
 from stochfuse.errors import UsageError, nearest
-from stochfuse.estimators.making import make
-from stochfuse.prediction.general import Spread, outcomes, spread
-from stochfuse.prediction.method import Settings
+from stochfuse.prediction.general import outcomes
+from stochfuse.prediction.method import Settings, group_of
+from stochfuse.prediction.sampled import states
 from stochfuse.prediction.states import predict_states
 from stochfuse.scenario import registry
-from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.registry import GENERAL, LFG, MONTE_CARLO, SIMPLIFIED
 from stochfuse.scenario.result import Result
 from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario
-from stochfuse.scenario.system import Noises, System
 
 TAKEN = (SIMPLIFIED, GENERAL, MONTE_CARLO)
 """Methods that average states."""
@@ -116,17 +111,17 @@ def expected_states(
         x, estimator = predict_states(scenario, z, rows).x, registry.BROADCAST_PRIOR  # type: ignore[arg-type]
     elif method == GENERAL:
         found = outcomes(scenario.system, rows, how, records=z)
-        group = np.empty(scenario.network.agents, dtype=int)
-        for g, agents in enumerate(found.groups):
-            group[list(agents)] = g
+        group = group_of(found.groups)
         x = found.states()[..., 0][:, :, group]
         variance = np.diagonal(found.state_spread(), axis1=-2, axis2=-1)[:, :, group]
         # what is left of equal numbers is rounding
         negligible = 1e-12 * (x**2).max(axis=(0, 1, 2))
         more = (np.sqrt(np.where(variance > negligible, variance, 0.0)), None)
     else:
-        x, *drawn = _sampled(scenario.system, rows, how, z)
-        more = (drawn[0], drawn[1])
+        drawn = states(scenario.system, rows, how, z)
+        sample = drawn.values.x[..., 0][drawn.which]
+        x, deviation = sample.mean(axis=1), sample.std(axis=1, ddof=1)
+        more = (deviation, deviation / np.sqrt(how.runs))
     return ExpectedStates(
         scenario,
         method,
@@ -189,30 +184,3 @@ def _linear(scenario: Scenario, agent: int, z: np.ndarray) -> np.ndarray:
         if H.any():
             out[step - 1] = (instrument.residual(z[step - 1][:, None], instrument.h(at, step)) + H @ at)[:, 0]
     return out
-
-
-def _sampled(system: System, links: LinkRows, how: Settings, z: np.ndarray) -> list[np.ndarray]:
-    """Mean, standard deviation and standard error of drawn outcomes, (rows, steps, agents, d) each."""
-    network, steps = system.network, range(1, system.steps + 1)
-    experiment = Experiment(
-        agents=network.agents,
-        events=[events(network, links, step) for step in steps],
-        detections=[[] for _ in steps],
-        make=partial(_made, system, how, relabellings(network, links, range(network.agents)), z),
-        of=_states,
-        runs=how.runs,
-        seed=how.seed,
-    )
-    drawn = sample(experiment, len(links.link))
-    x = drawn.values.x[..., 0][drawn.which]
-    deviation = x.std(axis=1, ddof=1)
-    return [x.mean(axis=1), deviation, deviation / np.sqrt(how.runs)]
-
-
-def _states(estimate: Any) -> Spread:
-    return spread(estimate)
-
-
-def _made(system: System, how: Settings, permutations: Sequence[tuple[int, ...]], z: np.ndarray) -> Any:
-    made = make(system, how.estimator, permutations, records=z, criterion=how.criterion)
-    return made.estimator, partial(made.claims, system, Noises())

@@ -1,9 +1,8 @@
 """Monte Carlo for a scenario: the sample, its means, and how far they can be trusted.
 
 Standard errors are those of the mean over independent runs.  Agents that are alike are averaged within a run first;
-their
-errors are dependent, the runs are not.  For a metric that is not linear in the covariance the error is carried through
-by the metric's derivative at the mean (delta method), taken by central differences.
+their errors are dependent, the runs are not.  For a metric that is not linear in the covariance the error is carried
+through by the metric's derivative at the mean (delta method), taken by central differences.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from stochfuse.estimators.making import make
 from stochfuse.estimators.protocol import Claims, Estimator
 from stochfuse.estimators.world import claimed_only, moments
 from stochfuse.kalman.metrics import Metric, Moments
-from stochfuse.prediction.general import groups_alike
+from stochfuse.prediction.general import groups_alike, spread
 from stochfuse.prediction.method import Averaged, Settings, group_of, joined
 from stochfuse.prediction.quantities import needed, value
 from stochfuse.scenario.network import LinkRows
@@ -131,11 +130,45 @@ def sampled(system: System, links: LinkRows, how: Settings, *, errors: bool = Fa
     UsageError
         If runs, seed or workers are out of range.
     """
+    _check(system, links, how)
+    network, kinds = system.network, system.labels
+    permutations = relabellings(network, links, kinds)
+    groups = groups_alike(network, links, kinds, permutations)
+    if how.estimator == OPTIMAL and network.agents > FEW:
+        return _optimum(system, links, how, groups, errors)
+    return Sampled(_drawn(system, links, how, permutations, errors=errors), groups)
+
+
+def states(system: System, links: LinkRows, how: Settings, records: np.ndarray) -> Sample:
+    """Draw a sample of an estimator's estimates given what was measured, whatever sensors might have missed.
+
+    Parameters
+    ----------
+    how : runs, seed, workers and estimator.
+    records : (steps, agents, p) measurements.
+
+    Returns
+    -------
+    Sample
+        Of `stochfuse.prediction.general.Spread`.
+
+    Raises
+    ------
+    UsageError
+        If runs, seed or workers are out of range.
+    """
+    _check(system, links, how)
+    permutations = relabellings(system.network, links, range(system.agents))
+    return _drawn(system, links, how, permutations, records=records)
+
+
+def _check(system: System, links: LinkRows, how: Settings) -> None:
+    """Raise UsageError if a sample is out of range."""
     given = (("runs", how.runs, 2), ("seed", how.seed, 0), ("workers", 1 if how.workers is None else how.workers, 1))
     for name, value_of, least in given:
         if value_of < least:
             raise UsageError(f"{name}: expected a whole number of at least {least}, got {value_of}")
-    network, kinds, rows = system.network, system.labels, len(links.link)
+    network, rows = system.network, len(links.link)
     most = MOST_OF_OPTIMUM if how.estimator == OPTIMAL else MOST_AGENTS
     if network.agents > most:
         raise UsageError(f"method 'monte-carlo' takes at most {most} agents, got {network.agents}")
@@ -145,24 +178,33 @@ def sampled(system: System, links: LinkRows, how: Settings, *, errors: bool = Fa
             f"runs: {how.runs} runs for {rows} link probabilities, {network.steps} steps and {network.agents} agents "
             f"are {numbers:.3g} values; expected at most {MOST_NUMBERS:.3g}"
         )
-    permutations = relabellings(network, links, kinds)
-    groups = groups_alike(network, links, kinds, permutations)
-    if how.estimator == OPTIMAL and network.agents > FEW:
-        return _optimum(system, links, how, groups, errors)
+
+
+def _drawn(
+    system: System,
+    links: LinkRows,
+    how: Settings,
+    permutations: list[tuple[int, ...]],
+    *,
+    errors: bool = False,
+    records: np.ndarray | None = None,
+) -> Sample:
+    """Draw outcomes, and keep what is claimed in them, moments of the errors, or estimates given measurements."""
+    network, rows = system.network, len(links.link)
+    steps = range(1, network.steps + 1)
     experiment = Experiment(
         agents=network.agents,
-        events=[events(network, links, step) for step in range(1, network.steps + 1)],
-        detections=[system.detections(step) for step in range(1, network.steps + 1)],
-        make=partial(_made, system, how, permutations, errors),
-        of=moments if errors else claimed_only,
+        events=[events(network, links, step) for step in steps],
+        detections=[system.detections(step) if records is None else [] for step in steps],
+        make=partial(_made, system, how, permutations, errors, records),
+        of=spread if records is not None else moments if errors else claimed_only,
         runs=how.runs,
         seed=how.seed,
     )
     workers = how.workers
     if workers is None:
         workers = len(os.sched_getaffinity(0)) if how.runs * rows >= MANY else 1
-    drawn = sample(experiment, rows, workers=workers)
-    return Sampled(drawn, groups)
+    return sample(experiment, rows, workers=workers)
 
 
 def _optimum(
@@ -187,8 +229,8 @@ def _optimum(
 
 
 def _made(
-    system: System, how: Settings, permutations: list[tuple[int, ...]], errors: bool
+    system: System, how: Settings, permutations: list[tuple[int, ...]], errors: bool, records: np.ndarray | None
 ) -> tuple[Estimator, Callable[[], Claims]]:
     """An estimator, and what to call for its numbers."""
-    made = make(system, how.estimator, permutations, errors=errors, criterion=how.criterion)
+    made = make(system, how.estimator, permutations, errors=errors, records=records, criterion=how.criterion)
     return made.estimator, partial(made.claims, system, Noises())
