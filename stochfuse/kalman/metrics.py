@@ -101,6 +101,10 @@ def metric(name: str, model: Labelled) -> Metric:
             return of(name, f"standard deviation of {names}", unit, lambda P: np.sqrt(P[..., chosen[0], chosen[0]]))
         root = f"RMS of {names} (root of the summed variances)" if len(chosen) > 1 else f"RMS of {names}"
         return of(name, root, unit, lambda P: np.sqrt(_trace(P[..., chosen, :][..., chosen])), mixed)
+    if name in ("var", "std", "rms"):
+        alike = [state for state, unit in zip(model.states, model.units, strict=True) if unit == model.units[0]]
+        some = ",".join(alike[: 1 if name != "rms" else None])
+        raise UsageError(f"metric: expected states after it, as in {name}:{some}, got '{name}' alone")
     near = nearest(kind, ("trace", "det", "max-eig", "var", "std", "rms"))
     raise UsageError(f"metric: expected {NAMES}, got '{name}'{near}")
 

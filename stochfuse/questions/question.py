@@ -189,5 +189,6 @@ def require_like_links(scenario: Scenario) -> None:
         what = "network.case" if network.cases else "link probabilities that differ in network.link"
         raise UsageError(
             f"target: expected a scenario with one link probability for all links and steps, or none, got {what}; "
-            "ask --sensitivity which link to improve, or take the links out of the scenario"
+            "ask --over network.scale=0:1 for the factor on all of them, --sensitivity which link to improve, or take "
+            "the links out of the scenario"
         )

@@ -42,7 +42,7 @@ from stochfuse.scenario.tables import read_filters, read_link, read_model, read_
 
 SCHEMA = "stochfuse.scenario/1"
 DEFAULT = "thesis-transient"
-LINK_KEYS = ("link", "radio", "sent", "received", "case", "burst")
+LINK_KEYS = ("link", "radio", "sent", "received", "case", "burst", "scale")
 CORRELATIONS = ("independent", "shared")
 _PRESETS = Path(__file__).parent / "presets"
 

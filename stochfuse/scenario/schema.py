@@ -249,6 +249,9 @@ class NetworkTable(StrictTable):
     radio: RadioTable | None = Field(
         None, description="link probabilities from a link budget and every agent's position, instead of link"
     )
+    scale: Number | None = Field(
+        None, description="factor on the probability of every link that the scenario names, which stays 1 at most"
+    )
     nodes: list[str] | None = Field(None, description="names of the agents in order: which nodes of a file they are")
     burst: BurstTable | None = Field(None, description="bursty links, instead of a link probability")
     hears: list[list[int]] | None = Field(

@@ -44,18 +44,21 @@ def read_network(check: Checker, table: Mapping[str, Any], agent_tables: Sequenc
     elif radio is not None and places:
         link = links_between(radio, places)
         _check_broadcast(check, "network.radio", link, agents, architecture)
-    burst = _burst(check, "network", table)
-    link = link if burst is None else mean_delivery(burst)
+    scale = _scale(check, table)
+    burst = _scaled_burst(_burst(check, "network", table), scale)
+    link = _scaled(link, scale) if burst is None else mean_delivery(burst)
     cases, bursts = [], []
     given = table.get("case")
     for i, case in enumerate(given if isinstance(given, list) else [], start=1):
         if not isinstance(case, dict):
             continue
         path = f"network.case[{i}].link"
-        own = link if case.get("link") is None else read_link(check, path, case["link"], agents, steps, architecture)
+        own = link
+        if case.get("link") is not None:
+            own = _scaled(read_link(check, path, case["link"], agents, steps, architecture), scale)
         bursty = burst if case.get("link") is None else None
         if case.get("burst") is not None:
-            bursty = _burst(check, f"network.case[{i}]", case)
+            bursty = _scaled_burst(_burst(check, f"network.case[{i}]", case), scale)
             own = own if bursty is None else mean_delivery(bursty)
         given_name = case.get("name", i)
         name = given_name if isinstance(given_name, str) else str(i)
@@ -87,6 +90,32 @@ def read_network(check: Checker, table: Mapping[str, Any], agent_tables: Sequenc
         delays=delays,
         counts=counts,
     )
+
+
+def _scale(check: Checker, table: Mapping[str, Any]) -> float | None:
+    """Read network.scale, the factor on every link probability that the scenario names."""
+    given = table.get("scale")
+    if given is None:
+        return None
+    if all(table.get(key) is None for key in ("link", "radio", "sent", "burst", "case")):
+        check.note("network.scale", "link probabilities in the scenario that it scales", "none")
+    expected = "a finite number of at least 0"
+    array = check.array("network.scale", given, expected)
+    if array is not None and (array.ndim or array < 0):
+        check.note("network.scale", expected, shown(given))
+        return None
+    return None if array is None else float(array)
+
+
+def _scaled(link: np.ndarray | None, scale: float | None) -> np.ndarray | None:
+    return link if link is None or scale is None else np.minimum(1.0, scale * link)
+
+
+def _scaled_burst(burst: np.ndarray | None, scale: float | None) -> np.ndarray | None:
+    """Return a bursty link whose deliveries, in good and in bad, are scaled."""
+    if burst is None or scale is None:
+        return burst
+    return np.concatenate([burst[:2], np.minimum(1.0, scale * burst[2:])])
 
 
 def _counts(check: Checker, table: Mapping[str, Any], agents: int) -> tuple[np.ndarray, np.ndarray] | None:

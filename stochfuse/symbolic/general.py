@@ -157,9 +157,20 @@ class GeneralForm:
                     value = ledger.combine(ending.step, [(v, sign) for v, sign in parts if v >= 0])
                     both = _product(_product(_exact(weight), _exact(factor)), [self._share(s) for s in share])
                     known = found.setdefault(value, [sympy.S.Zero] * (ending.events + 1))
+                    self._check_number(len(found))
                     for c, a in enumerate(_completed(both, ending.events)):
                         known[c] += a
         return ledger, found, ending.events
+
+    def _check_number(self, covariances: int) -> None:
+        """Raise UsageError, before any more work, if there are more than a closed form can hold."""
+        most = MOST_COVARIANCES_SYMBOLS if self.symbols else MOST_COVARIANCES_NUMBERS
+        if covariances > most:
+            instead = "give numbers for q, r and p0, or fewer agents or steps" if self.symbols else "give fewer steps"
+            raise UsageError(
+                f"step {self.step} of {self.agents} agents has more than {most} different covariances, too many for a "
+                f"closed form: {instead}, or use `stochfuse predict --method general`"
+            )
 
     def _share(self, share: float) -> Any:
         return sympy.Rational(round(share * self.agents), self.agents)
@@ -168,14 +179,6 @@ class GeneralForm:
     def _counted(self) -> list[tuple[Any, list[Any]]]:
         """Every different covariance (an element of an exact field) with its coefficients a_0 … a_L."""
         ledger, found, degree = self._enumerated
-        most = MOST_COVARIANCES_SYMBOLS if self.symbols else MOST_COVARIANCES_NUMBERS
-        if len(found) > most:
-            instead = "give numbers for q, r and p0, or fewer agents or steps" if self.symbols else "give fewer steps"
-            raise UsageError(
-                f"step {self.step} of {self.agents} agents has {len(found)} different covariances, too many for a "
-                f"closed "
-                f"form: {instead}, or use `stochfuse predict --method general`"
-            )
         generators = self.symbols or (sympy.Symbol("unused"),)
         made: Any = field(generators, sympy.QQ)
         K, named = made[0], dict(zip(generators, made[1:], strict=True))

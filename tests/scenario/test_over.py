@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import re
 
 import numpy as np
 import pytest
@@ -167,3 +168,53 @@ def test_items_hold_every_points_numbers():
     assert items.noises.Q is None
     assert items.noises.P0 is None
     assert module.MOST_KEYS == 2
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.5, 1.5, 3.0])
+def test_a_factor_on_all_links_is_the_links_times_it(scale):
+    µ = np.array([[1, 0.5, 0.9], [0.5, 1, 0.3], [0.7, 0.2, 1]])
+    given = {
+        "model": {"F": 1, "H": 1, "Q": 1, "R": 4},
+        "initial": {"P": 10},
+        "network": {"agents": 3, "steps": 3, "link": µ.tolist(), "case": [{"name": "weak", "link": 0.4}]},
+    }
+    scaled = copy.deepcopy(given)
+    scaled["network"]["scale"] = scale
+    by_hand = copy.deepcopy(given)
+    by_hand["network"] |= {
+        "link": np.minimum(1, scale * µ).tolist(),
+        "case": [{"name": "weak", "link": min(1, scale * 0.4)}],
+    }
+    np.testing.assert_array_equal(
+        sf.predict(scaled, method="optimal").covariance, sf.predict(by_hand, method="optimal").covariance
+    )
+
+
+def test_a_factor_on_bursty_links_is_one_on_what_they_deliver():
+    def with_burst(good, bad, **more):
+        burst = {"good_to_bad": 0.1, "bad_to_good": 0.3, "good": good, "bad": bad}
+        return {
+            "model": {"F": 1, "H": 1, "Q": 1, "R": 4},
+            "initial": {"P": 10},
+            "network": {"agents": 2, "steps": 3, "burst": burst, **more},
+        }
+
+    expected = sf.predict(with_burst(1.0, 0.4), method="general")
+    found = sf.predict(with_burst(0.8, 0.2, scale=2), method="general")
+    np.testing.assert_array_equal(found.covariance, expected.covariance)
+    np.testing.assert_allclose(found.link, 0.75 * 1.0 + 0.25 * 0.4, rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("network", "message"),
+    [
+        ({"scale": 2}, "network.scale: expected link probabilities in the scenario that it scales, got none"),
+        ({"link": 0.5, "scale": -1}, "network.scale: expected a finite number of at least 0, got -1"),
+        ({"link": 0.5, "scale": [1, 2]}, "network.scale: expected a number, got"),
+    ],
+)
+def test_a_factor_that_scales_nothing_or_is_none(network, message):
+    given = {"model": {"F": 1, "H": 1, "Q": 1, "R": 4}, "initial": {"P": 10}, "network": {"agents": 2, "steps": 3}}
+    given["network"] |= network
+    with pytest.raises(ScenarioError, match=re.escape(message)):
+        sf.load_scenario(given)
