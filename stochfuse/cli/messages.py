@@ -36,7 +36,7 @@ EXAMPLES = (
 )
 
 
-class Shown(NamedTuple):
+class Listed(NamedTuple):
     """What of the load is shown."""
 
     distribution: Annotated[
@@ -72,7 +72,7 @@ def messages(
     agent: Annotated[
         str, option("Whose load, where agents differ: mean or an agent's number; default: mean.", SHOWN, metavar="N")
     ] = "mean",
-    shown: Shown = Shown(),
+    shown: Listed = Listed(),
     method: Annotated[
         str,
         choice((EXACT, MONTE_CARLO), "exact; or monte-carlo, for networks too large for it; default: exact.", WORK),

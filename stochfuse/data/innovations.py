@@ -27,7 +27,7 @@ from stochfuse.kalman.kernel import Estimate, at_step, predict
 from stochfuse.scenario.system import System
 
 
-class Case(NamedTuple):
+class Supposition(NamedTuple):
     """What is supposed of a record.
 
     Parameters
@@ -44,7 +44,7 @@ class Case(NamedTuple):
     process: float = 1.0
     start: float = 1.0
 
-    def with_agent(self, agent: int, **changed: np.ndarray) -> Case:
+    def with_agent(self, agent: int, **changed: np.ndarray) -> Supposition:
         """Return the case with another z, scale or noise of an agent, counted from 0."""
         fields = {}
         for name, value in changed.items():
@@ -107,13 +107,13 @@ def setting_of(system: System, functions: Sequence[Function | None], first: Sequ
     return Setting(system, functions, tuple(first), together=system.one_state and system.noise is None)
 
 
-def innovations(setting: Setting, cases: Sequence[Case]) -> Innovations:
+def innovations(setting: Setting, cases: Sequence[Supposition]) -> Innovations:
     """Filter what each case says was measured; see the module."""
     with np.errstate(all="ignore"):
         return _Filters(setting, cases).run()
 
 
-def estimates(setting: Setting, case: Case) -> Estimate:
+def estimates(setting: Setting, case: Supposition) -> Estimate:
     """Return x (runs, steps − 1, filters, d) and P of the filters of a case, from step 2 on."""
     with np.errstate(all="ignore"):
         filters = _Filters(setting, [case])
@@ -124,7 +124,7 @@ def estimates(setting: Setting, case: Case) -> Estimate:
 class _Filters:
     """The filters of all cases, one over all agents or one for each."""
 
-    def __init__(self, setting: Setting, cases: Sequence[Case]) -> None:
+    def __init__(self, setting: Setting, cases: Sequence[Supposition]) -> None:
         self.world: World = world_of(setting.system)
         self.setting, self.cases = setting, cases
         runs, self.steps = cases[0].z[0].shape[:2]

@@ -27,7 +27,7 @@ import numpy as np
 from scipy.special import chdtri, ndtri
 
 from stochfuse.data.consistency import Series
-from stochfuse.data.innovations import Case, Innovations, Setting, estimates, innovations, setting_of
+from stochfuse.data.innovations import Innovations, Setting, Supposition, estimates, innovations, setting_of
 from stochfuse.data.records import Batch
 from stochfuse.scenario.scenario import Scenario
 from stochfuse.scenario.sensing import Instrument, parts_of
@@ -107,7 +107,7 @@ class Tried(NamedTuple):
     name: str
     agent: int | None
     text: str
-    case: Case
+    case: Supposition
     fitted: int = 0
 
 
@@ -137,7 +137,7 @@ def suspicions(scenario: Scenario, batch: Batch, known: np.ndarray) -> tuple[Sus
     )
     setting = setting_of(system, functions, [x[:runs] for x in batch.first])
     ones = tuple(np.ones(each.shape[-1]) for each in z)
-    trial = _Trial(scenario, setting, Case(z, ones, ones))
+    trial = _Trial(scenario, setting, Supposition(z, ones, ones))
     if _wrong(trial.now):
         return _explained(trial)
     if batch.truth is not None:
@@ -337,7 +337,7 @@ class _Errors(NamedTuple):
     far: bool
 
 
-def _errors(setting: Setting, case: Case, truth: np.ndarray, known: np.ndarray) -> _Errors | None:
+def _errors(setting: Setting, case: Supposition, truth: np.ndarray, known: np.ndarray) -> _Errors | None:
     with np.errstate(all="ignore"):
         x, P = estimates(setting, case)
     P, error = P[..., known, :][..., known], (x - truth[:, 1:])[..., known]
@@ -363,7 +363,7 @@ def _errors(setting: Setting, case: Case, truth: np.ndarray, known: np.ndarray) 
 class _Trial:
     """Everything that is suspected of a case."""
 
-    def __init__(self, scenario: Scenario, setting: Setting, case: Case, now: Innovations | None = None) -> None:
+    def __init__(self, scenario: Scenario, setting: Setting, case: Supposition, now: Innovations | None = None) -> None:
         now = innovations(setting, [case]) if now is None else now
         self.scenario, self.setting, self.case, self.now = scenario, setting, case, now
         self.units = [_units(scenario, i) for i in range(len(case.z))]
@@ -379,7 +379,7 @@ class _Trial:
         setting = self.setting._replace(truth=truth)
         return _Trial(self.scenario, setting, self.case)
 
-    def of(self, case: Case, now: Innovations) -> _Trial:
+    def of(self, case: Supposition, now: Innovations) -> _Trial:
         """Return the same of another case, whose innovations are known."""
         return _Trial(self.scenario, self.setting, case, now)
 
@@ -453,7 +453,7 @@ class _Trial:
         case = self._noisier(who, [np.full(len(self.R[i]), factor) for i in who])
         return Tried("R-scaled", agent, f"{called}: an R of {factor:.2g} times the scenario's", case, 1)
 
-    def _noisier(self, who: Sequence[int], factors: Sequence[np.ndarray]) -> Case:
+    def _noisier(self, who: Sequence[int], factors: Sequence[np.ndarray]) -> Supposition:
         case = self.case
         for i, factor in zip(who, factors, strict=True):
             case = case.with_agent(i, noise=case.noise[i] * factor)

@@ -88,7 +88,7 @@ TERMS = {
 }
 
 
-class Explanation(NamedTuple):
+class Entry(NamedTuple):
     """A word, what kind of thing it names, and a paragraph."""
 
     word: str
@@ -96,33 +96,32 @@ class Explanation(NamedTuple):
     text: str
 
 
-def explanations() -> dict[str, Explanation]:
+def explanations() -> dict[str, Entry]:
     """Return every word that can be explained."""
-    found = [Explanation(e.name, "estimator", _sentences(e.title, f"Source: {e.source}")) for e in registry.ESTIMATOR]
+    found = [Entry(e.name, "estimator", _sentences(e.title, f"Source: {e.source}")) for e in registry.ESTIMATOR]
     found += [
-        Explanation(e.name, "method", _sentences(f"{e.title}: {e.help}", f"Source: {e.source}", f"Nature: {e.nature}"))
+        Entry(e.name, "method", _sentences(f"{e.title}: {e.help}", f"Source: {e.source}", f"Nature: {e.nature}"))
         for e in registry.ENGINE
     ]
     shorts = [
-        Explanation(s.name, "method", f"Short for --estimator {s.estimator} --method {s.engine}.")
-        for s in registry.SHORT
+        Entry(s.name, "method", f"Short for --estimator {s.estimator} --method {s.engine}.") for s in registry.SHORT
     ]
-    found += [Explanation(q.name, "quantity", _sentences(q.help)) for q in registry.QUANTITY]
-    found += [Explanation(m.name.partition(":")[0], "metric", _sentences(m.help)) for m in registry.METRIC]
-    found += [Explanation(s.name.partition(":")[0], "statistic", _sentences(s.help)) for s in registry.STATISTIC]
+    found += [Entry(q.name, "quantity", _sentences(q.help)) for q in registry.QUANTITY]
+    found += [Entry(m.name.partition(":")[0], "metric", _sentences(m.help)) for m in registry.METRIC]
+    found += [Entry(s.name.partition(":")[0], "statistic", _sentences(s.help)) for s in registry.STATISTIC]
     found += [
-        Explanation(
+        Entry(
             f.name,
             "feature of a scenario",
             _sentences(f"in a scenario file: {f.key}", "stochfuse methods --matrix shows what takes it"),
         )
         for f in capabilities.FEATURES
     ]
-    known: dict[str, Explanation] = {}
-    for one in (*found, *shorts, *(Explanation(word, "term", text) for word, text in TERMS.items())):
+    known: dict[str, Entry] = {}
+    for one in (*found, *shorts, *(Entry(word, "term", text) for word, text in TERMS.items())):
         before = known.get(one.word)
         known[one.word] = (
-            one if before is None else Explanation(one.word, f"{before.kind}, {one.kind}", f"{before.text} {one.text}")
+            one if before is None else Entry(one.word, f"{before.kind}, {one.kind}", f"{before.text} {one.text}")
         )
     return known
 
@@ -148,7 +147,7 @@ def explained(word: str | None, width: int) -> tuple[str, Report]:
     text = (
         "\n".join(fill(f"{one.word} ({one.kind}): {one.text}", width, subsequent_indent="  ") for one in chosen) + "\n"
     )
-    keys = Explanation._fields
+    keys = Entry._fields
     report = Report(
         lambda: Table(("What the words mean",), keys, (), tuple(tuple(one) for one in chosen)),
         lambda: to_csv(keys, chosen),

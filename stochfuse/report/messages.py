@@ -14,7 +14,7 @@ from stochfuse.kalman.metrics import Metric
 from stochfuse.questions.messages import IDENTITY_BYTES, NUMBER_BYTES, Accuracy, Bytes, Load, in_bytes
 from stochfuse.report.plot import COLORS, MARKERS, below, figure_class, spread, titled
 from stochfuse.report.predictions import PredictionView
-from stochfuse.report.rows import Rows
+from stochfuse.report.rows import ResultRows
 from stochfuse.report.table import Report, Table, number, to_csv
 from stochfuse.scenario.registry import LFG, NAIVE
 
@@ -66,9 +66,9 @@ class LoadView:
     digits: int = 5
 
     @cached_property
-    def rows(self) -> Rows:
+    def rows(self) -> ResultRows:
         """What the rows stand for."""
-        return Rows(self.loads[0])
+        return ResultRows(self.loads[0])
 
     def bytes_of(self, load: Load) -> Bytes:
         """Return a load in bytes."""

@@ -23,7 +23,7 @@ from stochfuse.prediction.quantities import unit as unit_of
 from stochfuse.prediction.result import Prediction
 from stochfuse.prediction.swept import Swept
 from stochfuse.report.plot import DASHES, MARKERS, below, direct, figure_class, shades, spread, titled
-from stochfuse.report.rows import Curves, Rows
+from stochfuse.report.rows import Curves, ResultRows
 from stochfuse.report.table import Report, Table, number, to_csv
 from stochfuse.scenario.registry import OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.registry import title as method_title
@@ -65,9 +65,9 @@ class PredictionView:
     at: tuple[int, ...] | None = None
 
     @cached_property
-    def rows(self) -> Rows:
+    def rows(self) -> ResultRows:
         """What the rows stand for."""
-        return Rows(self.prediction)
+        return ResultRows(self.prediction)
 
     @cached_property
     def parts(self) -> tuple[Prediction, ...]:

@@ -22,7 +22,7 @@ Cells = tuple[Any, ...]
 
 
 @dataclass(frozen=True)
-class Rows:
+class ResultRows:
     """The rows of a result.
 
     Parameters

@@ -20,7 +20,7 @@ from stochfuse.questions.question import Question, described, named
 from stochfuse.questions.sensitivity import Sensitivity, ShareOfGain
 from stochfuse.report.plot import MARKERS, below, figure_class, spread, titled
 from stochfuse.report.predictions import PredictionView
-from stochfuse.report.rows import Rows
+from stochfuse.report.rows import ResultRows
 from stochfuse.report.table import Report, Table, number, to_csv
 
 SCHEMA = "stochfuse.solution/1"
@@ -181,7 +181,7 @@ def value_sheet(found: LeastValue, digits: int = 5) -> SolutionSheet:
     """Say the least or greatest value of a key, the value beside it that misses, and what proves it."""
     asked, unit = found.question, f" {found.unit}" if found.unit else ""
     low, high = (float(found.grid[0, i]) for i in (0, -1))
-    at, µ = f"{found.at:.{PRECISE}g}{unit}", Rows(found.prediction).cells(0)[-1]
+    at, µ = f"{found.at:.{PRECISE}g}{unit}", ResultRows(found.prediction).cells(0)[-1]
     at_most = f"{described(asked)} is at most {found.target:.9g}, at µ = {µ}"
     single = len(found.met) == 1 and found.proof != "grid"
     which = "at and above which" if found.direction == "least" else "at and below which"

@@ -10,7 +10,7 @@ import pytest
 
 import stochfuse as sf
 from stochfuse.report.predictions import PredictionView
-from stochfuse.report.rows import Rows
+from stochfuse.report.rows import ResultRows
 from tests.cli.command import run, strict_json
 
 THREE = ("--link", "0.5", "--steps", "3")
@@ -215,7 +215,7 @@ def test_wrong_use_is_one_message(words, message):
 
 def test_figures_run_along_the_key():
     swept = sf.predict("thesis-transient", [0.5], over={"network.agents": [2, 3, 5]})
-    curves = Rows(swept).curves(swept.steps)
+    curves = ResultRows(swept).curves(swept.steps)
     assert curves.label == "network.agents"
     assert curves.whole
     assert curves.names == [f"k = {k}" for k in range(1, 6)]
@@ -231,7 +231,7 @@ def test_figures_run_along_the_key():
 
 def test_a_second_key_or_link_makes_a_curve_each_at_the_last_step():
     swept = sf.predict("thesis-transient", [0.2, 0.5], over={"model.R": [50, 100], "network.steps": [2, 3]})
-    curves = Rows(swept).curves(swept.steps)
+    curves = ResultRows(swept).curves(swept.steps)
     assert curves.names == [
         f"network.steps = {k}, µ = {µ}" for k, µ in ((2, 0.2), (2, 0.5), (3, 0.2), (3, 0.5))
     ]  # fmt: skip
@@ -273,7 +273,7 @@ def test_the_link_is_said_row_by_row_where_it_differs():
     mapping = sf.load_scenario("thesis-transient", agents=2).to_mapping()
     mapping["network"]["link"] = [[0, 0.4], [0.6, 0]]
     swept = sf.predict(mapping, over={"network.link[1][2]": [0.2, 0.8]})
-    assert Rows(swept).keys == ("network.link[1][2]", "mean µ")
+    assert ResultRows(swept).keys == ("network.link[1][2]", "mean µ")
     assert swept.link.tolist() == pytest.approx([0.4, 0.7])
     view = PredictionView(swept, metric("trace", swept.scenario.model))
     assert "; µ = " not in view.whom

@@ -129,7 +129,9 @@ def test_bad_requests(arguments, message):
 
 
 def test_forms_that_would_fill_books_are_refused():
-    with pytest.raises(sf.UsageError, match="more than 60 different covariances, too many for a closed form: give numbers"):
+    with pytest.raises(
+        sf.UsageError, match="more than 60 different covariances, too many for a closed form: give numbers"
+    ):
         derive_general(3, 3).closed()
     with pytest.raises(sf.UsageError, match="too many for a closed form: give fewer steps"):
         derive_general(3, 5, 25, 100, 100, architecture="cyclic").closed()
