@@ -273,22 +273,6 @@ class Written(NamedTuple):
         write_report(report, self.kind, self.output)
 
 
-class Unplotted(NamedTuple):
-    """Where an answer goes that has no figure."""
-
-    format: FormatOption = None
-    output: OutputOption = None
-    digits: DigitsOption = 5
-
-    def check(self, *inputs: str) -> None:
-        """Raise UsageError early if a file can never be written, or is an input."""
-        check_files(self.output, None, *inputs)
-
-    def write(self, report: Report) -> None:
-        """Write a report in the format asked for."""
-        write_report(report, chosen_format(self.format, self.output), self.output)
-
-
 def gathered(command: Callable[..., None]) -> Callable[..., None]:
     """Lay out a command's groups of options as single ones, in the order of its parameters."""
     hints = get_type_hints(command, include_extras=True)

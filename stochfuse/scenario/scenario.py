@@ -159,14 +159,6 @@ def require_one_state(scenario: Scenario, who: str) -> None:
         raise UsageError(f"{who}: expected agents that track one state by one model, got agents with {what}")
 
 
-def require_independent_noise(scenario: Scenario, who: str) -> None:
-    """Raise UsageError if measurement noises hang together."""
-    if scenario.noise is not None:
-        raise UsageError(
-            f"{who}: expected independent measurement noises, got [noise] with a correlation or a disturbance"
-        )
-
-
 def _first(link: np.ndarray, steps: int) -> np.ndarray:
     return link[:steps] if link.ndim in (1, 3) else link
 
