@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from stochfuse.kalman.checks import covariance_fault, first_fault
-from stochfuse.kalman.metrics import Moments
-from stochfuse.scenario.registry import LFG
+from stochfuse.kalman.metrics import Metric, Moments
+from stochfuse.scenario.registry import LFG, OPTIMUM
 
 if TYPE_CHECKING:
     from stochfuse.prediction.general import Outcomes
@@ -22,6 +22,24 @@ if TYPE_CHECKING:
 
 MOST_GRAPHS = 100_000
 RUNS, SEED = 1000, 1
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What of a prediction will be looked at: what a precision is asked of.
+
+    Parameters
+    ----------
+    quantities : names; default: the one that is predicted.
+    metrics : numbers that are made of it; default: the scenario's metric, else the trace.
+    agent : "mean", "worst", "best" or a number from 1.
+    steps : which of them; default: all.
+    """
+
+    quantities: tuple[str, ...] = ()
+    metrics: tuple[Metric, ...] = ()
+    agent: int | str = "mean"
+    steps: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -37,6 +55,12 @@ class Settings:
     workers : monte-carlo: processes; default: one for small samples, else one per processor.
     criterion : covariance-intersection, split-ci: what the weights minimise, "det", "trace" or "max-eig",
         in each fusion by itself: over several steps that need not be the least.
+    control : monte-carlo: "optimum", the exact optimum as control variate wherever that helps, or "none".
+    precision : monte-carlo: draw until every standard error shown is below that share of its value, 0.002 or "0.2%",
+        in the place of `runs`; where an exact engine takes the scenario it is used.
+    at_most : with a precision: seconds after which no more is drawn, 60 or "60s"; the runs then depend on the machine.
+    exact_first : with a precision: whether an exact engine is used where it is cheap.
+    shown : with a precision: what of the prediction it is asked of.
     """
 
     estimator: str = LFG
@@ -46,6 +70,11 @@ class Settings:
     seed: int = SEED
     workers: int | None = None
     criterion: str = "det"
+    control: str = OPTIMUM
+    precision: float | str | None = None
+    at_most: float | str | None = None
+    exact_first: bool = True
+    shown: Shown = Shown()
 
 
 class Averaged(NamedTuple):
