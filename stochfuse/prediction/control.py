@@ -229,8 +229,8 @@ def expectation(system: System, links: LinkRows) -> Expected | None:
     if found.bound.max() > TIGHT:
         return None
     # of every agent, whose group it is in
-    P, b = (m if m is None else np.repeat(m, n, axis=2) if alike else m for m in (found.P, found.bias))
-    return Expected(_moments(P, P[:0] if system.error is None or b is None else b), found.bound)
+    P, b, M = (m if m is None else np.repeat(m, n, axis=2) if alike else m for m in found[:3])
+    return Expected(Moments(P, P, None, P) if system.error is None else Moments(P, P, b, M), found.bound)
 
 
 def estimated(system: System, links: LinkRows, how: Settings, correlation: float) -> Expected:

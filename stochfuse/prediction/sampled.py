@@ -313,7 +313,7 @@ def helped(
 
 
 def _reduction(plain: Sampled, found: Sampled, system: System, shown: Shown) -> float:
-    """Variance of what is shown, relative to its values and added up, without a control over that with it; 0 of none."""
+    """Variance of what is shown, relative to its values, without a control over that with it; 0 of none."""
     (values, error), (_, less) = plain.shown(system, shown), found.shown(system, shown)
     there = (error > 0) & (values != 0)
     before, after = (((e[there] / values[there]) ** 2).sum() for e in (error, less))
