@@ -151,8 +151,9 @@ def crosscheck(
     unsaid = [f for f in _families(read, prediction, chosen)[0] if not knows(prediction, f)]
     if unsaid:
         whose = prediction.estimator if prediction.estimator in ESTIMATORS else estimator or given.estimator or LFG
-        asked = {name: settings[name] for name in ("runs", "seed", "workers", "criterion") if name in settings}
-        again = predict(given, rows, MONTE_CARLO, "actual", estimator=whose, **asked)
+        kept = ("runs", "seed", "workers", "criterion", "control", "precision", "at_most")
+        asked = {name: settings[name] for name in kept if name in settings}
+        again = predict(given, rows, MONTE_CARLO, "actual", estimator=whose, exact_first=False, **asked)
         what = " and ".join(dict.fromkeys("NEES" if f.quantity == "nees" else f.metric for f in unsaid))
         said.append(
             f"method {prediction.method} knows averages only: the {what} expected is sampled, {again.meta['runs']} "

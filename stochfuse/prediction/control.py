@@ -131,19 +131,31 @@ class Control:
                 moved.append(self.expected.weight * β.mean(axis=0) * (blocks - blocks.mean(axis=0)))
         return Moments(*terms), None if self.expected.further is None else Moments(*moved)
 
+    def applied(self, y: np.ndarray, row: int, step: int, group: Sequence[int]) -> np.ndarray:
+        """Terms (runs,) of a number that every run has, corrected by the trace of the optimum; where that is exact."""
+        if self.expected.further is not None:
+            return y
+        x, mean = (
+            np.trace(P, axis1=-2, axis2=-1) for P in (self.runs.P[row, :, step], self.expected.mean.P[row, step])
+        )
+        off = x[:, list(group)].mean(axis=1) - mean[list(group)].mean()
+        return y - coefficients(y, off, 0.0) * off
 
-def coefficients(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+
+def coefficients(y: np.ndarray, x: np.ndarray, usual: float = 1.0) -> np.ndarray:
     """β of all blocks of runs but a run's own, for every run and entry, (runs, …).
 
     Parameters
     ----------
     y, x : (runs, …) what is corrected, and the control less its expectation.
+    usual : β_0, what β is where the runs do not say it: 1 of covariances, which move with the optimum's; 0 of what has
+        other units.
 
     Notes
     -----
-    β = (Σ (x − x̄)(y − ȳ) + n x̄²) / (Σ (x − x̄)² + n x̄²): where x̄ is as far from 0 as the spread of x lets it be, the
-    second terms are those of one run among n; where outcomes that matter are too rare to have been met, so that x̄ lies
-    far off, they make β 1, as the estimator's covariance moves with the optimum's.
+    β = (Σ (x − x̄)(y − ȳ) + β_0 n x̄²) / (Σ (x − x̄)² + n x̄²): where x̄ is as far from 0 as the spread of x lets it be,
+    the second terms are those of one run among n; where outcomes that matter are too rare to have been met, so that x̄
+    lies far off, they make β usual.
     """
     runs = len(x)
     starts = np.arange(min(BLOCKS, runs)) * runs // min(BLOCKS, runs)
@@ -156,8 +168,8 @@ def coefficients(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
     u, v = x - x.mean(axis=0), y - y.mean(axis=0)
     U, far = sums(u), left * (sums(x) / left) ** 2
-    variance, common = sums(u * u) - U * U / left + far, sums(u * v) - U * sums(v) / left + far
-    β = np.divide(common, variance, out=np.ones_like(variance), where=variance > 0)
+    variance, common = sums(u * u) - U * U / left + far, sums(u * v) - U * sums(v) / left + usual * far
+    β = np.divide(common, variance, out=np.full_like(variance, usual), where=variance > 0)
     return β[np.searchsorted(starts, np.arange(runs), side="right") - 1]
 
 

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import inf
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from stochfuse.errors import UsageError
 from stochfuse.kalman.checks import covariance_fault, first_fault
 from stochfuse.kalman.metrics import Metric, Moments
 from stochfuse.scenario.registry import LFG, OPTIMUM
@@ -149,4 +151,41 @@ def faults_of(moments: Moments) -> dict[int, str]:
         for item, first in enumerate(map(first_fault, M)):
             if first is not None:
                 found.setdefault(item, f"the {name} covariance at step {first[0]} is {first[1]}")
+    return found
+
+
+def share(value: float | str) -> float:
+    """Return a precision as a share: of 0.002, "0.002" or "0.2%".
+
+    Raises
+    ------
+    UsageError
+        If it is none, or not between 0 and 1.
+    """
+    text = str(value).strip()
+    try:
+        found = float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
+    except ValueError:
+        found = 0.0
+    if not 0.0 < found < 1.0:
+        raise UsageError(f"precision: expected a share between 0 and 1, such as 0.2% or 0.002, got '{value}'")
+    return found
+
+
+def seconds(value: float | str) -> float:
+    """Return a time in seconds: of 60, "60s" or "2min".
+
+    Raises
+    ------
+    UsageError
+        If it is none, or not positive.
+    """
+    text = str(value).strip()
+    unit = next((u for u in ("min", "s", "h") if text.endswith(u)), "")
+    try:
+        found = float(text.removesuffix(unit)) * {"min": 60.0, "h": 3600.0}.get(unit, 1.0)
+    except ValueError:
+        found = 0.0
+    if not 0.0 < found < inf:
+        raise UsageError(f"at-most: expected a time such as 60s or 2min, got '{value}'")
     return found

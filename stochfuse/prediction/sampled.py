@@ -33,9 +33,9 @@ from stochfuse.kalman.metrics import Metric, Moments
 from stochfuse.kalman.metrics import metric as metric_of
 from stochfuse.prediction.control import KIND, WORTH, Control, Expected, estimated, expectation, no_control, optimum_of
 from stochfuse.prediction.general import groups_alike, spread
-from stochfuse.prediction.method import Averaged, Settings, Shown, group_of, joined
+from stochfuse.prediction.method import Averaged, Settings, Shown, group_of, joined, seconds, share
 from stochfuse.prediction.quantities import needed, value
-from stochfuse.prediction.stopping import Parts, sampled_to, seconds, share
+from stochfuse.prediction.stopping import Parts, sampled_to
 from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.registry import NO_CONTROL, OPTIMAL, STAND_ALONE
 from stochfuse.scenario.system import Items, Noises, System
@@ -256,7 +256,7 @@ def sampled(
     numbers = len(links.link) * system.steps * system.agents
     most = min(MOST_NUMBERS // numbers, MOST_ENTRIES // numbers // system.dimension**2)
     limit = None if how.at_most is None else seconds(how.at_most)
-    (found, said, control), _, reached = sampled_to(share(how.precision), limit, most, draw, judge)
+    (found, said, control), reached = sampled_to(share(how.precision), limit, most, draw, judge)
     meta = {"control": control._asdict(), "precision": {"asked": reached.asked, "reached": reached.reached}}
     told = f"precision {100 * reached.reached:.2g} % of each value after {found.runs:,} runs"
     told += f", {100 * reached.asked:.3g} % asked for: {reached.stopped}" if reached.stopped else ""

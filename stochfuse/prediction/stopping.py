@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 
 from stochfuse.engines.monte_carlo import BLOCK
 from stochfuse.engines.progress import within
-from stochfuse.errors import UsageError
 
 FIRST = 400
 """Runs of the first stage."""
@@ -29,7 +28,7 @@ GROWTH = 40
 PARTS = 8
 """Parts that a stage is drawn in, after each of which the time left is told."""
 FEW = 20
-"""Runs for which no further part is begun."""
+"""Runs that show what a run takes, and for which no further part is begun."""
 
 Parts = list[tuple[int, int]]
 """Number of runs, and first block of random numbers, of every part of a sample."""
@@ -49,41 +48,46 @@ class Reached(NamedTuple):
     stopped: str = ""
 
 
-def share(value: float | str) -> float:
-    """Return a precision as a share: of 0.002, "0.002" or "0.2%".
+class _Drawing:
+    """A sample that grows by parts, as long as there is time.
 
-    Raises
-    ------
-    UsageError
-        If it is none, or not between 0 and 1.
+    Parameters
+    ----------
+    draw : goes on with a sample (None at first), by so many runs, from a block of random numbers on.
+    at_most : seconds, or None.
+    said : what is drawn for, in words.
     """
-    text = str(value).strip()
-    try:
-        found = float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
-    except ValueError:
-        found = 0.0
-    if not 0.0 < found < 1.0:
-        raise UsageError(f"precision: expected a share between 0 and 1, such as 0.2% or 0.002, got '{value}'")
-    return found
 
+    def __init__(self, draw: Callable[[Any, int, int], Any], at_most: float | None, said: str) -> None:
+        self.sample: Any = None
+        self.parts: Parts = []
+        self._draw, self._said, self._begun = draw, said, time.monotonic()
+        self._end = inf if at_most is None else self._begun + at_most
 
-def seconds(value: float | str) -> float:
-    """Return a time in seconds: of 60, "60s" or "2min".
+    @property
+    def runs(self) -> int:
+        """Runs so far."""
+        return sum(runs for runs, _ in self.parts)
 
-    Raises
-    ------
-    UsageError
-        If it is none, or not positive.
-    """
-    text = str(value).strip()
-    unit = next((u for u in ("min", "s", "h") if text.endswith(u)), "")
-    try:
-        found = float(text.removesuffix(unit)) * {"min": 60.0, "h": 3600.0}.get(unit, 1.0)
-    except ValueError:
-        found = 0.0
-    if not 0.0 < found < inf:
-        raise UsageError(f"at-most: expected a time such as 60s or 2min, got '{value}'")
-    return found
+    def to(self, target: int) -> bool:
+        """Draw until there are so many runs; whether there was the time."""
+        missing = target - self.runs
+        while self.runs < target:
+            left, rest = self._end - time.monotonic(), target - self.runs
+            now = min(rest, max(BLOCK, -(-missing // PARTS)))
+            if self.parts:
+                cost = (time.monotonic() - self._begun) / self.runs
+                now, left = min(now, int(min(left / cost, rest))), min(left, rest * cost)
+                if now < min(FEW, rest):
+                    return False
+            elif left < inf:
+                now = min(now, FEW)  # which show what a run takes
+            told = f", about {left:.0f} s left" if self.parts else ""
+            with within(f"{self._said}{told}", self.runs + 1, target):
+                first = sum(-(-runs // BLOCK) for runs, _ in self.parts)
+                self.sample = self._draw(self.sample, now, first)
+            self.parts.append((now, first))
+        return True
 
 
 def sampled_to(
@@ -92,7 +96,7 @@ def sampled_to(
     most: int,
     draw: Callable[[Any, int, int], Any],
     judge: Callable[[Any, Parts], tuple[Any, float]],
-) -> tuple[Any, Parts, Reached]:
+) -> tuple[Any, Reached]:
     """Draw until a precision is reached.
 
     Parameters
@@ -102,35 +106,17 @@ def sampled_to(
     draw : goes on with a sample (None at first), by so many runs, from a block of random numbers on.
     judge : what a sample, of some parts, comes to, and its largest share of a standard error in its value.
     """
-    begun, parts = time.monotonic(), [(min(FIRST, most), 0)]
-    drawn = draw(None, *parts[0])
+    drawing, target = _Drawing(draw, at_most, f"to {100 * asked:.3g} % of every value"), min(FIRST, most)
     while True:
-        found, reached = judge(drawn, parts)
-        runs = sum(n for n, _ in parts)
+        in_time = drawing.to(target)
+        found, reached = judge(drawing.sample, drawing.parts)
         if reached <= asked:
-            return found, parts, Reached(asked, reached)
-        if runs >= most:
-            return found, parts, Reached(asked, reached, f"{most:,} runs are the most that are held")
-        cost = (time.monotonic() - begun) / runs
-        end = inf if at_most is None else begun + at_most
-        before = runs
-        target = min(most, stage(runs, reached / asked))
-        while runs < target:
-            affordable = (end - time.monotonic()) / cost
-            now = min(max(BLOCK, -(-(target - before) // PARTS)), target - runs)
-            if affordable < now:
-                now = int(affordable)
-            if now < FEW and now < target - runs:
-                break
-            left = min((target - runs) * cost, end - time.monotonic())
-            with within(f"to {asked:.3g} of every value, about {left:.0f} s left", runs + 1, target):
-                parts.append((now, parts[-1][1] + -(-parts[-1][0] // BLOCK)))
-                drawn = draw(drawn, *parts[-1])
-            runs += now
-        if runs < target:
-            found, reached = judge(drawn, parts) if runs > before else (found, reached)
-            stopped = "" if reached <= asked else f"the {at_most:g} s were over"
-            return found, parts, Reached(asked, reached, stopped)
+            return found, Reached(asked, reached)
+        if not in_time:
+            return found, Reached(asked, reached, f"{at_most:g} s were over")
+        if target >= most:
+            return found, Reached(asked, reached, f"{most:,} runs are the most that are held")
+        target = min(most, stage(target, reached / asked))
 
 
 def stage(runs: int, excess: float) -> int:
