@@ -121,13 +121,15 @@ def _predict(scenario: Scenario, link: Any, method: str, settings: dict[str, Any
     # what is compared with others is sampled, even where an exact engine would do
     settings = {**settings, "exact_first": False}
     if method != MONTE_CARLO:
-        settings = {name: value for name, value in settings.items() if name not in ("precision", "at_most")}
+        settings = {name: value for name, value in settings.items() if name not in OF_SAMPLES}
     try:
         return predict(scenario, link, method, **settings)
     except UsageError as error:
         raise UsageError(f"{method} cannot be compared here, leave it out of the methods: {error}") from None
 
 
+OF_SAMPLES = ("precision", "at_most", "control")
+"""Settings that exact engines refuse."""
 SIDE_BY_SIDE = ("claimed", "actual", "consistency")
 
 
@@ -225,7 +227,7 @@ def _estimated(
     exchange = max(exchange_of(some, link) for some in every)
     if {"runs", "seed", "workers"} & set(settings) or exchange > EASY_EXCHANGE:
         return predict(scenario, link, MONTE_CARLO, quantity, estimator=estimator, **settings)
-    easy = {name: value for name, value in easy.items() if name not in ("precision", "at_most")}
+    easy = {name: value for name, value in easy.items() if name not in OF_SAMPLES}
     try:
         return predict(scenario, link, GENERAL, quantity, estimator=estimator, **easy)
     except TooManyError:

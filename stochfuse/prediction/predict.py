@@ -488,6 +488,8 @@ def _check_precision(method: str, how: Settings, given: Mapping[str, Any]) -> No
         seconds(how.at_most)
         if how.precision is None:
             raise UsageError(f"at-most: expected a precision to go with it, got {how.at_most} alone")
+    if given.get("control") is not None and method not in (MONTE_CARLO, OPTIMAL):
+        raise UsageError(f"control: expected method {MONTE_CARLO}, whose values are sampled, got {method}")
     if how.precision is not None:
         share(how.precision)
         if method != MONTE_CARLO:
@@ -503,8 +505,9 @@ def _by_any(scenario: Scenario, link: Any, quantity: str, settings: Mapping[str,
     features = capabilities.features_of(scenario.system, link_rows(scenario, link))
     engines = capabilities.engine_for(name, features) or [registry.GENERAL]
     for engine in engines:
+        given = {n: v for n, v in settings.items() if n != "control" or engine == MONTE_CARLO}
         try:
-            found = predict(scenario, link, engine, quantity, **settings)
+            found = predict(scenario, link, engine, quantity, **given)
         except TooManyError:
             if engine == engines[-1]:
                 raise

@@ -31,7 +31,17 @@ from stochfuse.estimators.protocol import Claims, Estimator
 from stochfuse.estimators.world import claimed_only, moments
 from stochfuse.kalman.metrics import Metric, Moments
 from stochfuse.kalman.metrics import metric as metric_of
-from stochfuse.prediction.control import KIND, WORTH, Control, Expected, estimated, expectation, no_control, optimum_of
+from stochfuse.prediction.control import (
+    KIND,
+    WORTH,
+    Control,
+    Expected,
+    coefficients,
+    estimated,
+    expectation,
+    no_control,
+    optimum_of,
+)
 from stochfuse.prediction.general import groups_alike, spread
 from stochfuse.prediction.method import Averaged, Settings, Shown, group_of, joined, seconds, share
 from stochfuse.prediction.quantities import needed, value
@@ -287,29 +297,23 @@ def helped(
     if why is not None or not plain.odds.any():
         return plain, f"control: none; {why}" if why else "", Reduced()
     runs, expected = optimum_of(system, links, how, parts), expectation(system, links)
-    if expected is not None:
+    # of an unknown expectation as if it were the sample's mean, to see whether further runs are worth their time
+    own = Expected(runs.map(lambda m: m.mean(axis=1)), np.zeros(plain.odds.shape[:2]))
+    found = replace(plain, control=Control(runs, expected or own))
+    reduction = _reduction(plain, found, system, shown)
+    if expected is None and reduction >= WORTH:
+        expected = estimated(system, links, how, 1.0 - 1.0 / reduction)
         found = replace(plain, control=Control(runs, expected))
         reduction = _reduction(plain, found, system, shown)
-    else:
-        # as if the sample's mean were the expectation, to see whether further runs are worth their time
-        own = Expected(runs.map(lambda m: m.mean(axis=1)), np.zeros(plain.odds.shape[:2]))
-        reduction = _reduction(plain, replace(plain, control=Control(runs, own)), system, shown)
-        if reduction >= WORTH:
-            expected = estimated(system, links, how, 1.0 - 1.0 / reduction)
-            found = replace(plain, control=Control(runs, expected))
-            reduction = _reduction(plain, found, system, shown)
     if reduction == 0.0:  # nothing is uncertain
         return plain, "", Reduced()
-    if reduction < WORTH:
-        return (
-            plain,
-            f"control: none; the exact optimum takes away too little of the variance (1/{reduction:.2f})",
-            Reduced(),
-        )
+    if reduction < WORTH or expected is None:
+        why = f"the exact optimum takes away too little of the variance (1/{reduction:.2f})"
+        return plain, f"control: none; {why}", Reduced()
     known = "exact" if expected.further is None else "estimated"
     by = "" if known == "exact" else f"; its mean from {expected.runs:.3g} times as many runs of its own"
     told = f"1/{float(f'{reduction:.3g}'):,g}" if reduction < 1e6 else "less than a millionth"
-    return found, f"control: exact optimum; variance {told}{by}", Reduced(KIND, min(reduction, MOST_REDUCED), known)
+    return found, f"control: {KIND}; variance {told}{by}", Reduced(KIND, min(reduction, MOST_REDUCED), known)
 
 
 def _reduction(plain: Sampled, found: Sampled, system: System, shown: Shown) -> float:
@@ -361,27 +365,33 @@ def _extended(before: Sample | None, more: Sample) -> Sample:
     return Sample(values, np.concatenate([before.which, more.which + len(before.values[0])], axis=1))
 
 
-def states(system: System, links: LinkRows, how: Settings, records: np.ndarray) -> Sample:
+def states(system: System, links: LinkRows, how: Settings, records: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Draw a sample of an estimator's estimates given what was measured, whatever sensors might have missed.
 
     Parameters
     ----------
-    how : runs, seed, workers and estimator.
+    how : runs, seed, workers, estimator and control.
     records : (steps, agents, p) measurements.
 
     Returns
     -------
-    Sample
-        Of `stochfuse.prediction.general.Spread`.
-
-    Raises
-    ------
-    UsageError
-        If runs, seed or workers are out of range.
+    x, terms : ndarray
+        (rows, runs, steps, agents, d) estimates, and what they are corrected to by the variances of the optimum where
+        these are known exactly; their mean and its standard error are those of the expected estimate.
     """
     _check(system, links, how)
     permutations = relabellings(system.network, links, range(system.agents))
-    return _drawn(system, links, how, permutations, records=records)
+    drawn = _drawn(system, links, how, permutations, records=records)
+    x = drawn.values.x[..., 0][drawn.which]
+    expected = None if no_control(system, links, how) is not None else expectation(system, links)
+    if expected is None:
+        return x, x
+    # variances say of an estimate only how it hangs together with them: there is no usual coefficient
+    of, mean = (
+        np.diagonal(P, axis1=-2, axis2=-1) for P in (optimum_of(system, links, how, [(how.runs, 0)]).P, expected.mean.P)
+    )
+    off = of - mean[:, None]
+    return x, np.stack([x[r] - coefficients(x[r], off[r], 0.0) * off[r] for r in range(len(x))])
 
 
 def _check(system: System, links: LinkRows, how: Settings) -> None:
