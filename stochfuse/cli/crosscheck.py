@@ -46,7 +46,7 @@ def crosscheck(
     changes: Changes = Changes(),
     columns: Annotated[
         str | None,
-        option("Names that FILE has for columns: covariance=P_trace,link=mu.", SHOWN, metavar="OURS=THEIRS"),
+        option("FILE's own names: covariance=P_trace,link=mu.", SHOWN, metavar="OURS=THEIRS"),
     ] = None,
     method: Annotated[
         str | None,
@@ -71,7 +71,7 @@ def crosscheck(
 ) -> None:
     """Compare a simulator's results with the prediction; exit 0 if they agree, 1 if they do not.
 
-    Values: covariance (claimed after fusion, as the metric says; default: trace) or covariance:METRIC, squared_error,
+    Values: covariance (claimed, as the metric says; default: trace) or covariance:METRIC, squared_error,
     error:STATE (signed), nees; one or several. Per cell a z-score; the verdict corrects for their number.
     """
     from stochfuse.data.crosscheck import crosscheck as check

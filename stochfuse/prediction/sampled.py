@@ -133,14 +133,17 @@ class Sampled:
             shown[row, step] = of(mean)
             parts = [terms.map(lambda m: m - m.mean(axis=0)), *([_averaged(moved, share)] if moved else [])]
             error = np.sqrt(sum(_spread(of, mean, deviations) for deviations in parts))
-            error = error if error > ROUNDING * np.abs(shown[row, step]) else 0.0
-            if any(self.scarce(row, step, g) for g in groups) and all(_constant(m) for m in drawn):
+            constant, rounding = all(_constant(m) for m in drawn), ROUNDING * np.abs(shown[row, step])
+            if constant or self.control is None:
+                error = error if error > rounding else 0.0
+            if constant and any(self.scarce(row, step, g) for g in groups):
                 error = max(error, self._unseen(of, mean, drawn))
-            out[row, step] = (
-                error
-                if self.control is None
-                else np.hypot(error, self.control.expected.bound[row, step] * np.abs(shown[row, step]))
-            )
+            if self.control is not None and not constant:
+                # what the control takes away whole is still known to rounding only
+                error = max(
+                    rounding, np.hypot(error, self.control.expected.bound[row, step] * np.abs(shown[row, step]))
+                )
+            out[row, step] = error
         return shown, out
 
     def scarce(self, row: int, step: int, group: int) -> bool:
