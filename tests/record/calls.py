@@ -269,7 +269,9 @@ def _lines() -> Iterator[tuple[str, Callable[[], Any]]]:
     ]  # fmt: skip
     lines += [f"scenario show {p}" for p in PRESETS]
     for line in lines:
-        yield line, partial(command, *line.split())
+        # 0.1 had no control for its samples
+        plain = ["--control", "none"] if "--runs" in line and not line.startswith("messages") else []
+        yield line, partial(command, *line.split(), *plain)
 
 
 STUDY = """
