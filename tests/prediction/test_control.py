@@ -65,7 +65,7 @@ def test_a_control_that_never_varies_has_the_usual_coefficient():
 )
 def test_what_it_leaves_of_the_variance(estimator, quantity, least):
     """At equal runs, by the standard errors; that these are true is tested elsewhere."""
-    asked = {"estimator": estimator, "quantity": quantity, "runs": 400}
+    asked = {"estimator": estimator, "quantity": quantity, "runs": 300}
     scenario = sf.load_scenario("thesis-transient")
     plain, found = (drawn(scenario, [0.25, 0.5, 0.75], control=c, **asked) for c in ("none", "optimum"))
     ratio = (plain.standard_error() / found.standard_error())[:, -1] ** 2

@@ -123,25 +123,10 @@ def test_stopping_does_not_bias():
 
 
 def test_the_command_line():
-    found = strict_json(
-        run(
-            *[
-                "predict",
-                "--precision",
-                "0.5%",
-                "--steps",
-                "4",
-                "--link",
-                "0.5",
-                "--estimator",
-                "lwin",
-                "--format",
-                "json",
-            ]
-        )
-    )
+    line = "predict --precision 0.5% --steps 4 --link 0.5 --estimator lwin --format json"
+    found = strict_json(run(*line.split()).stdout)
     assert found["meta"]["precision"]["reached"] <= 0.005
-    told = run(*["predict", "--agents", "4", "--steps", "3", "--link", "0.5", "--precision", "0.1%", "--at", "3"])
+    told = run(*["predict", "--agents", "5", "--steps", "2", "--link", "0.5", "--precision", "0.1%", "--at", "2"])
     assert "note: precision 0.0" in told.stderr
     assert "note: control: exact optimum; variance 1/" in told.stderr
     refused = run("predict", "--precision", "0.2%", "--method", "general", code=2)
