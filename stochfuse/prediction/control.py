@@ -54,6 +54,8 @@ WORTH = 1.2
 """Reduction of the variance below which a sample is left as it is."""
 BLOCKS = 25
 """Blocks of runs; β of one is from all the others."""
+UNLIKELY = 3.0
+"""Standard errors of the optimum's mean from its expectation that tell of outcomes that were not met."""
 FLAT = 1e-12
 """Least eigenvalue of a covariance, scaled to unit variances, that is rounding."""
 MOST_NUMBERS, MOST_STATES, MOST_SETS = 20_000_000, 600, 8
@@ -153,9 +155,9 @@ def coefficients(y: np.ndarray, x: np.ndarray, usual: float = 1.0) -> np.ndarray
 
     Notes
     -----
-    β = (Σ (x − x̄)(y − ȳ) + β_0 n x̄²) / (Σ (x − x̄)² + n x̄²): where x̄ is as far from 0 as the spread of x lets it be,
-    the second terms are those of one run among n; where outcomes that matter are too rare to have been met, so that x̄
-    lies far off, they make β usual.
+    β = (Σ (x − x̄)(y − ȳ) + β_0 f) / (Σ (x − x̄)² + f) with f = n x̄² − 9 Σ (x − x̄)²/n, 0 where that is less, that is
+    unless x̄ lies beyond three of its standard errors from 0: where outcomes that matter are too rare to have been met,
+    β tends to what is usual.
     """
     runs = len(x)
     starts = np.arange(min(BLOCKS, runs)) * runs // min(BLOCKS, runs)
@@ -167,9 +169,11 @@ def coefficients(y: np.ndarray, x: np.ndarray, usual: float = 1.0) -> np.ndarray
         return by_block.sum(axis=0) - by_block
 
     u, v = x - x.mean(axis=0), y - y.mean(axis=0)
-    U, far = sums(u), left * (sums(x) / left) ** 2
-    variance, common = sums(u * u) - U * U / left + far, sums(u * v) - U * sums(v) / left + usual * far
-    β = np.divide(common, variance, out=np.full_like(variance, usual), where=variance > 0)
+    U = sums(u)
+    variance, common = sums(u * u) - U * U / left, sums(u * v) - U * sums(v) / left
+    far = np.maximum(sums(x) ** 2 / left - (UNLIKELY**2 / left) * variance, 0.0)
+    total = variance + far
+    β = np.divide(common + usual * far, total, out=np.full_like(total, usual), where=total > 0)
     return β[np.searchsorted(starts, np.arange(runs), side="right") - 1]
 
 

@@ -7,9 +7,10 @@ through by the metric's derivative at the mean (delta method), taken by central 
 Wherever it helps, the exact optimum is the sample's control variate (`stochfuse.prediction.control`).  How many runs a
 precision takes is found in `stochfuse.prediction.stopping`.
 
-Runs that all met one value say nothing of those that they did not meet.  Where chance has a say in it, the standard
-error is then not 0: of a sample with a control it is what the exact optimum says of what is missing; of a plain one
-the value times 1/runs, as if outcomes of that probability were off by as much as the value itself.
+Runs that all met one value say nothing of what they did not meet.  Where they are too few to have met more than the
+likeliest, the standard error is all the same not 0: of a sample with a control it is no less than the correction, what
+the exact optimum says of all that is missing; of a plain one, if it met one value only, no less than the value times
+1/runs, as if outcomes of that probability were off by as much as the value itself.
 """
 
 from __future__ import annotations
@@ -136,7 +137,8 @@ class Sampled:
             constant, rounding = all(_constant(m) for m in drawn), ROUNDING * np.abs(shown[row, step])
             if constant or self.control is None:
                 error = error if error > rounding else 0.0
-            if constant and any(self.scarce(row, step, g) for g in groups):
+            known = self.control is not None and self.control.expected.further is None
+            if any(self.scarce(row, step, g) for g in groups) and (constant or known):
                 error = max(error, self._unseen(of, mean, drawn))
             if self.control is not None and not constant:
                 # what the control takes away whole is still known to rounding only
@@ -151,10 +153,10 @@ class Sampled:
         return 0.0 < self.odds[row, step, group] * self.runs < SCARCE
 
     def _unseen(self, of: Callable[[Moments], np.ndarray], mean: Moments, drawn: Moments) -> float:
-        """Standard error of a value where all runs met the same."""
+        """Standard error of a value where hardly any run met anything but the likeliest."""
         if self.control is None or self.control.expected.further is not None:
             return float(np.abs(of(mean))) / self.runs
-        gap = float(np.abs(of(mean) - of(drawn.map(lambda m: m[0]))))
+        gap = float(np.abs(of(mean) - of(drawn.map(lambda m: m.mean(axis=0)))))
         return gap if gap > ROUNDING * np.abs(of(mean)) else 0.0
 
     def shown(self, system: System, what: Shown) -> tuple[np.ndarray, np.ndarray]:
