@@ -66,7 +66,7 @@ COSTS = (30.0, 8.0)
 """What a run of an estimator that removes what is common, or of another one, costs in runs of the optimum, about."""
 FURTHER = (4.0, 40.0)
 """Least and most further runs of the optimum for every run."""
-MOST_ENTRIES = 100_000_000
+MOST_HELD = 100_000_000
 """Entries of the optimum's covariances that are held."""
 SEPARATE = 1 << 20
 """First block of the further runs: beyond any that a sample comes to."""
@@ -195,8 +195,8 @@ def no_control(system: System, links: LinkRows, how: Settings) -> str | None:
     except UsageError as error:
         return str(error)
     entries = how.runs * len(links.link) * system.steps * system.agents * system.dimension**2
-    if entries > MOST_ENTRIES:
-        return f"the optimum of every run would take {entries:.3g} entries, at most {MOST_ENTRIES:.3g} are held"
+    if entries > MOST_HELD:
+        return f"the optimum of every run would take {entries:.3g} entries, at most {MOST_HELD:.3g} are held"
     return None
 
 
@@ -261,9 +261,9 @@ def estimated(system: System, links: LinkRows, how: Settings, correlation: float
     further = min(max(best, least), most)
     runs = ceil(further * how.runs)
     numbers = len(links.link) * system.steps * system.agents * system.dimension**2
-    size = max(2, min(BLOCK, -(-runs // (2 * BLOCKS)), MOST_ENTRIES // numbers))
+    size = max(2, min(BLOCK, -(-runs // (2 * BLOCKS)), MOST_HELD // numbers))
     blocks = -(-runs // size)
-    follow = partial(sample_optimum, system, links, size, how.seed, workers=how.workers, paired=True)
+    follow = partial(sample_optimum, system, links, size, how.seed, workers=how.workers)
     found = [_mean(follow(first=SEPARATE + block)) for block in range(blocks)]
     means = Moments(*(None if m[0] is None else np.stack(m, axis=1) for m in zip(*found, strict=True)))
     bound = np.zeros((len(links.link), system.steps))

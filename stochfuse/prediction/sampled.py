@@ -34,6 +34,7 @@ from stochfuse.kalman.metrics import Metric, Moments
 from stochfuse.kalman.metrics import metric as metric_of
 from stochfuse.prediction.control import (
     KIND,
+    MOST_HELD,
     WORTH,
     Control,
     Expected,
@@ -222,7 +223,7 @@ def averaged(system: System, items: Items, how: Settings, errors: bool) -> Avera
                     natures=np.full(len(some), "sampled"),
                     estimator=how.estimator,
                     rounding=np.zeros(len(some)),
-                    notes=notes,
+                    notes=notes if items.noises.common else (),
                     sampled=found,
                     meta={"runs": found.runs, "seed": how.seed, **meta},
                 ),
@@ -269,7 +270,7 @@ def sampled(
         (found, said, control), _ = judge(draw(None, how.runs, 0), [(how.runs, 0)])
         return found, tuple(filter(None, (said, *rare(system, links, found)))), {"control": control._asdict()}
     numbers = len(links.link) * system.steps * system.agents
-    most = min(MOST_NUMBERS // numbers, MOST_ENTRIES // numbers // system.dimension**2)
+    most = min(MOST_NUMBERS // numbers, MOST_HELD // numbers // system.dimension**2)
     limit = None if how.at_most is None else seconds(how.at_most)
     (found, said, control), reached = sampled_to(share(how.precision), limit, most, draw, judge)
     meta = {"control": control._asdict(), "precision": {"asked": reached.asked, "reached": reached.reached}}
