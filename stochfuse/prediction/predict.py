@@ -60,8 +60,8 @@ HARDNESS = ("claimed", OPTIMAL, "actual", "consistency", "bias", "rms")
 """The moments of the actual error contain what is claimed; bias and rms have more to note."""
 EASY, EASY_EXCHANGE = 2000, 12
 """Graphs, and binary logarithm of the outcomes of one exchange, up to which outcomes are enumerated unasked."""
-PATIENT = 5.0
-"""Seconds of a limit of time that stand for so many graphs, generously."""
+PATIENT, EASILY = 5.0, 1 << 17
+"""Seconds of a limit of time that go with so many graphs, generously, and with so many outcomes of all of them."""
 WORTHLESS = 1e-3
 """Relative rounding beyond which it is no answer."""
 
@@ -193,10 +193,11 @@ def _exactly(scenario: Scenario, link: Any, how: Settings, quantity: str) -> Pre
     try:
         if how.estimator == OPTIMAL:
             found = predict(scenario, link, OPTIMAL, quantity)
-        elif exchange_of(scenario, link) > EASY_EXCHANGE:
-            return None
         else:
-            kept = {"estimator": how.estimator, "criterion": how.criterion, "max_graphs": int(EASY * more)}
+            graphs = int(more * min(EASY, EASILY / 2.0 ** exchange_of(scenario, link)))
+            if not graphs:
+                return None
+            kept = {"estimator": how.estimator, "criterion": how.criterion, "max_graphs": graphs}
             found = predict(scenario, link, GENERAL, quantity, **kept)
     except (UsageError, NoAnswerError):
         return None
