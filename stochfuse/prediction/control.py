@@ -54,7 +54,7 @@ WORTH = 1.2
 """Reduction of the variance below which a sample is left as it is."""
 BLOCKS = 25
 """Blocks of runs; β of one is from all the others."""
-UNLIKELY = 3.0
+UNLIKELY = 5.0
 """Standard errors of the optimum's mean from its expectation that tell of outcomes that were not met."""
 FLAT = 1e-12
 """Least eigenvalue of a covariance, scaled to unit variances, that is rounding."""
@@ -155,8 +155,8 @@ def coefficients(y: np.ndarray, x: np.ndarray, usual: float = 1.0) -> np.ndarray
 
     Notes
     -----
-    β = (Σ (x − x̄)(y − ȳ) + β_0 f) / (Σ (x − x̄)² + f) with f = n x̄² − 9 Σ (x − x̄)²/n, 0 where that is less, that is
-    unless x̄ lies beyond three of its standard errors from 0: where outcomes that matter are too rare to have been met,
+    β = (Σ (x − x̄)(y − ȳ) + β_0 f) / (Σ (x − x̄)² + f) with f = n x̄² − 25 Σ (x − x̄)²/n, 0 where that is less, that is
+    unless x̄ lies beyond five of its standard errors from 0: where outcomes that matter are too rare to have been met,
     β tends to what is usual.
     """
     runs = len(x)
