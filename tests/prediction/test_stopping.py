@@ -110,16 +110,16 @@ def test_a_time_is_a_limit_and_says_what_was_reached():
 
 @pytest.mark.slow
 def test_stopping_does_not_bias():
-    """z-scores of 150 samples whose size was chosen by their first stage, without the control that would hide it."""
+    """z-scores of 120 samples whose size was chosen by their first stage, without the control that would hide it."""
     scenario = sf.load_scenario("thesis-transient", steps=2)
     exact = sf.predict(scenario, [0.4], "naive").values()[0, -1]
     asked = {"estimator": "naive", "precision": 0.007, "exact_first": False, "control": "none"}
-    found = [sf.predict(scenario, [0.4], seed=seed, **asked) for seed in range(150)]
+    found = [sf.predict(scenario, [0.4], seed=seed, **asked) for seed in range(120)]
     assert len({p.sampled.runs for p in found}) > 50
     z = np.array([(p.values() - exact)[0, -1] / p.standard_error()[0, -1] for p in found])
-    assert abs(z.mean()) < 3.5 / np.sqrt(150)
-    assert abs(z.std() - 1) < 3.5 / np.sqrt(300)
-    assert (np.abs(z) < 1.96).mean() > 0.95 - 3.5 * np.sqrt(0.05 * 0.95 / 150)
+    assert abs(z.mean()) < 3.5 / np.sqrt(120)
+    assert abs(z.std() - 1) < 3.5 / np.sqrt(240)
+    assert (np.abs(z) < 1.96).mean() > 0.95 - 3.5 * np.sqrt(0.05 * 0.95 / 120)
 
 
 def test_the_command_line():
