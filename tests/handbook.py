@@ -21,6 +21,8 @@ CHAPTERS = {
     "The Local Fusion Graph": "estimators.local_fusion_graph",
     "The general formulation": "engines.enumeration",
     "The contact chain: the exact optimum": "engines.contact_chain",
+    "The optimum as control of a sample": "prediction.control",
+    "Sampling to a precision": "prediction.stopping",
     "What is true: footprints of the noises": "estimators.world",
     "Claimed, actual and what follows": "prediction.quantities",
     "The steady state": "prediction.steady_state",

@@ -17,6 +17,7 @@ from stochfuse.cli.options import (
     Graphs,
     MetricOption,
     OverOption,
+    Precisely,
     Sampling,
     ScenarioArgument,
     Weighing,
@@ -84,6 +85,7 @@ def compare(
     all_steps: Annotated[bool, option("Estimators: every step, not only the last.", SHOWN, "--all-steps")] = False,
     relative: Annotated[bool, option("Differences in per cent of the reference.", SHOWN, "--relative")] = False,
     sampling: Sampling = Sampling(),
+    precisely: Precisely = Precisely(),
     graphs: Graphs = Graphs(),
     weighing: Weighing = Weighing(),
     to: Written = Written(),
@@ -94,6 +96,7 @@ def compare(
     shared information twice), monte-carlo is sampled, with its standard error.
     """
     from stochfuse.kalman.metrics import metric as metric_of
+    from stochfuse.prediction.method import Shown
 
     to.check(scenario)
     given, links = changes.of(scenario)
@@ -112,6 +115,7 @@ def compare(
         [GENERAL, MONTE_CARLO] if several and methods is None else ways,
         estimator=None if several or names is None else _known(names[0]),
         **sampling._asdict(),
+        **precisely._asdict(),
         **graphs._asdict(),
         **weighing._asdict(),
     )
@@ -126,6 +130,7 @@ def compare(
     quantities = quantity_names(quantity or ("claimed,actual,consistency" if several else "claimed"))
     chosen, chosen_agent = metric_of(metric or given.metric or "trace", given.model), whose(agent, given)
     steps = steps_at(at, given)
+    settings["shown"] = Shown(tuple(quantities), (chosen,), chosen_agent, steps)
     shown = _Shown(chosen, chosen_agent, steps, to)
     if several:
         only = None if names == [ALL] else names

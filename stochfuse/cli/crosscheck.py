@@ -13,6 +13,7 @@ from stochfuse.cli.options import (
     EstimatorOption,
     Graphs,
     MetricOption,
+    Precisely,
     Sampling,
     ScenarioArgument,
     Weighing,
@@ -45,7 +46,7 @@ def crosscheck(
     changes: Changes = Changes(),
     columns: Annotated[
         str | None,
-        option("Names that FILE has for columns: covariance=P_trace,link=mu.", SHOWN, metavar="OURS=THEIRS"),
+        option("FILE's own names: covariance=P_trace,link=mu.", SHOWN, metavar="OURS=THEIRS"),
     ] = None,
     method: Annotated[
         str | None,
@@ -60,26 +61,26 @@ def crosscheck(
     metric: MetricOption = None,
     alpha: Annotated[
         float,
-        option(
-            "Probability that a right simulator is called wrong, over all cells; default: 0.001.", SHOWN, metavar="P"
-        ),
+        option("Probability to call a right simulator wrong; default: 0.001.", SHOWN, metavar="P"),
     ] = 0.001,
     sampling: Sampling = Sampling(),
+    precisely: Precisely = Precisely(),
     graphs: Graphs = Graphs(),
     weighing: Weighing = Weighing(),
     to: Written = Written(),
 ) -> None:
     """Compare a simulator's results with the prediction; exit 0 if they agree, 1 if they do not.
 
-    Values: covariance (claimed after fusion, as the metric says; default: trace) or covariance:METRIC, squared_error,
-    error:STATE (signed), nees; one or several. Per cell a z-score; the verdict corrects for the number of cells.
+    Values: covariance (claimed, as the metric says; default: trace) or covariance:METRIC, squared_error,
+    error:STATE (signed), nees; one or several. Per cell a z-score; the verdict corrects for their number.
     """
     from stochfuse.data.crosscheck import crosscheck as check
     from stochfuse.data.results import read_results
     from stochfuse.report import crosschecks
 
     to.check(file, scenario)
-    given = {"estimator": estimator, **sampling._asdict(), **graphs._asdict(), **weighing._asdict()}
+    given = {"estimator": estimator, **sampling._asdict(), **precisely._asdict()}
+    given |= {**graphs._asdict(), **weighing._asdict()}
     settings = settings_for([GENERAL, MONTE_CARLO] if method is None else [method], **given)
     if not 0 < alpha < 1:
         raise UsageError(f"--alpha: expected a probability between 0 and 1, got {alpha:g}")

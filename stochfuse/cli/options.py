@@ -20,7 +20,17 @@ import typer
 from stochfuse.cli.progress import quiet
 from stochfuse.errors import UsageError, nearest
 from stochfuse.scenario import registry
-from stochfuse.scenario.registry import CRITERIA, ESTIMATORS, GENERAL, METHODS, MONTE_CARLO, NAIVE, OPTIMAL, QUANTITIES
+from stochfuse.scenario.registry import (
+    CONTROLS,
+    CRITERIA,
+    ESTIMATORS,
+    GENERAL,
+    METHODS,
+    MONTE_CARLO,
+    NAIVE,
+    OPTIMAL,
+    QUANTITIES,
+)
 
 if TYPE_CHECKING:
     from stochfuse.report.table import Report
@@ -110,9 +120,7 @@ MetricOption = Annotated[
         metavar="NAME", autocompletion=completed([m.name.partition("STATE")[0] for m in registry.METRIC]),
     ),
 ]  # fmt: skip
-AgentOption = Annotated[
-    str | None, option("Whose, where agents differ: mean, worst, best or a number; default: mean.", SHOWN, metavar="N")
-]
+AgentOption = Annotated[str | None, option("Whose: mean (the default), worst, best or a number.", SHOWN, metavar="N")]
 QuantityOption = Annotated[
     str,
     option(
@@ -235,6 +243,24 @@ class Sampling(NamedTuple):
     ] = None
 
 
+class Precisely(NamedTuple):
+    """How exactly values are sampled."""
+
+    precision: Annotated[
+        str | None,
+        option("Draw until every ± is below this share of its value: 0.2%.", WORK, metavar="P%"),
+    ] = None
+    at_most: Annotated[
+        str | None, option("With --precision: stop after that time, 60s or 2min.", WORK + RARE, metavar="TIME")
+    ] = None
+    control: Annotated[
+        str | None,
+        choice(
+            CONTROLS, "monte-carlo: control variate, optimum (where it helps) or none; default: optimum.", WORK + RARE
+        ),
+    ] = None
+
+
 class Weighing(NamedTuple):
     """What only some engines and estimators have."""
 
@@ -333,6 +359,9 @@ APPLIES_TO = {
     "runs": SAMPLED,
     "seed": SAMPLED,
     "workers": SAMPLED,
+    "precision": SAMPLED,
+    "at_most": SAMPLED,
+    "control": SAMPLED,
     "criterion": BOTH,
 }
 """Methods that each setting means something to; the optimum of many unlike agents is sampled too."""
@@ -348,7 +377,7 @@ def settings_for(methods: Sequence[str], **settings: Any) -> dict[str, Any]:
     """
     given = {name: value for name, value in settings.items() if value is not None and value is not False}
     for name in given:
-        also = {OPTIMAL} if APPLIES_TO[name] == SAMPLED else set()
+        also = {OPTIMAL} if name in ("runs", "seed", "workers") else set()
         if not (also | set(APPLIES_TO[name])) & set(methods):
             option = "--" + name.replace("_", "-")
             raise UsageError(f"{option}: expected method {' or '.join(APPLIES_TO[name])}, got {', '.join(methods)}")

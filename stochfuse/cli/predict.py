@@ -18,6 +18,7 @@ from stochfuse.cli.options import (
     MethodOption,
     MetricOption,
     OverOption,
+    Precisely,
     QuantityOption,
     Sampling,
     ScenarioArgument,
@@ -31,7 +32,7 @@ from stochfuse.cli.options import (
     whose,
 )
 from stochfuse.errors import UsageError
-from stochfuse.scenario.registry import GENERAL, NAIVE, SIMPLIFIED, STATE
+from stochfuse.scenario.registry import GENERAL, MONTE_CARLO, NAIVE, SIMPLIFIED, STATE
 
 if TYPE_CHECKING:
     from stochfuse.report.predictions import PredictionView
@@ -73,6 +74,7 @@ def predict(
     method: MethodOption = None,
     estimator: EstimatorOption = None,
     sampling: Sampling = Sampling(),
+    precisely: Precisely = Precisely(),
     graphs: Graphs = Graphs(),
     weighing: Weighing = Weighing(),
     to: Written = Written(),
@@ -82,6 +84,7 @@ def predict(
     Without a scenario: the thesis' transient one. Options override the scenario.
     """
     from stochfuse.kalman.metrics import metric as metric_of
+    from stochfuse.prediction.method import Shown
     from stochfuse.prediction.predict import predict_several as run
     from stochfuse.prediction.quantities import check
     from stochfuse.report.predictions import PredictionView, report
@@ -94,7 +97,9 @@ def predict(
             if value:
                 raise UsageError(f"{flag}: expected without --quantity {STATE}")
         way = method or (SIMPLIFIED if estimator is None else GENERAL)
-        settings = settings_for([way], **{"estimator": estimator, **sampling._asdict(), **graphs._asdict()})
+        settings = settings_for(
+            [way], **{"estimator": estimator, **sampling._asdict(), **precisely._asdict(), **graphs._asdict()}
+        )
         _states(scenario, changes, measurements, StatesAsked(way, agent, at), settings, to)
         return
     if measurements is not None:
@@ -109,8 +114,10 @@ def predict(
     for name in quantities:
         check(name, chosen)
     # an estimator without a method picks the exact engine that takes it, else sampling
-    free = method is None and given.method is None and estimator is not None
-    way = (given.method or (GENERAL if free else SIMPLIFIED)) if method is None else method
+    unsaid = method is None and given.method is None
+    free = unsaid and estimator is not None and precisely.precision is None
+    otherwise = GENERAL if free else SIMPLIFIED if precisely.precision is None else MONTE_CARLO
+    way = (given.method or otherwise) if method is None else method
     if statistic != "mean":
         if way not in (GENERAL, NAIVE):
             raise UsageError(f"--statistic {statistic}: expected --method general or naive, got {way}")
@@ -120,13 +127,15 @@ def predict(
 
         for name in quantities:
             check_statistic(statistic, name, chosen)
-    given_settings = {"estimator": estimator, **sampling._asdict(), **graphs._asdict(), **weighing._asdict()}
+    given_settings = {"estimator": estimator, **sampling._asdict(), **precisely._asdict()}
+    given_settings |= {**graphs._asdict(), **weighing._asdict()}
     if interval is not None:
         for flag, given_too in (("--normalise", normalise), ("--statistic", statistic != "mean"), ("--over", swept)):
             if given_too:
                 raise UsageError(f"{flag}: expected without --interval")
     asked_for = {"steady": steady, "over": swept} | ({} if interval is None else {"interval": interval})
     settings = {**asked_for, **settings_for([way], **given_settings)}
+    settings["shown"] = Shown(metrics=(chosen,), agent=chosen_agent, steps=steps)
     if swept and statistic != "mean":
         settings["one_by_one"] = True  # whose outcomes are kept
     if normalise and swept and any(key.name == PLACES["link"] for key in swept.keys):

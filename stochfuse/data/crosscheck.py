@@ -28,6 +28,7 @@ from stochfuse.data.together import Block, blocks_of, together
 from stochfuse.errors import StochfuseError, UsageError, nearest
 from stochfuse.kalman.metrics import Metric
 from stochfuse.kalman.metrics import metric as metric_of
+from stochfuse.prediction.method import Shown
 from stochfuse.prediction.predict import predict
 from stochfuse.prediction.result import Prediction
 from stochfuse.scenario.network import LinkRows, stacked_rows
@@ -144,6 +145,7 @@ def crosscheck(
     given = given.until(last)
     chosen = metric_of(metric or given.metric or "trace", given.model)
     rows, said = rows_of(read, given, link)
+    settings = {"shown": Shown(metrics=(chosen,), agent="worst"), **settings}
     prediction, unknown = _predicted(read, given, rows, method, {"estimator": estimator, **settings})
     read = replace(read, observed=tuple(o for o in read.observed if o.column not in unknown))
     said += [f"column {name} is not compared: {why}" for name, why in unknown.items()]
@@ -151,8 +153,9 @@ def crosscheck(
     unsaid = [f for f in _families(read, prediction, chosen)[0] if not knows(prediction, f)]
     if unsaid:
         whose = prediction.estimator if prediction.estimator in ESTIMATORS else estimator or given.estimator or LFG
-        asked = {name: settings[name] for name in ("runs", "seed", "workers", "criterion") if name in settings}
-        again = predict(given, rows, MONTE_CARLO, "actual", estimator=whose, **asked)
+        kept = ("runs", "seed", "workers", "criterion", "control", "precision", "at_most", "shown")
+        asked = {name: settings[name] for name in kept if name in settings}
+        again = predict(given, rows, MONTE_CARLO, "actual", estimator=whose, exact_first=False, **asked)
         what = " and ".join(dict.fromkeys("NEES" if f.quantity == "nees" else f.metric for f in unsaid))
         said.append(
             f"method {prediction.method} knows averages only: the {what} expected is sampled, {again.meta['runs']} "

@@ -272,6 +272,8 @@ def _of_sample(sampled: Sampled, parts: Parts, step: int, group: int) -> Expecte
     for row in range(rows):
         which = index[row, :, step - 1][:, agents]
         drawn[row] = means[which].mean(axis=1)
+        if sampled.control is not None:
+            drawn[row] = sampled.control.applied(drawn[row], row, step - 1, agents)
         used, counts = np.unique(which, return_counts=True)
         deviations = means[used] - drawn[row].mean()
         variance[row], third[row] = _central(counts / counts.sum(), deviations, variances[used], thirds[used])

@@ -71,6 +71,7 @@ from stochfuse.kalman.kernel import (
 )
 from stochfuse.scenario.model import Model, Sensor
 from stochfuse.scenario.network import LinkRows, Network, delivery_after_failures, number_of_senders
+from stochfuse.scenario.system import System
 
 MOST_STATES = 4096
 """States of the chain."""
@@ -301,6 +302,11 @@ def _failed(
     return failed
 
 
+def by_number(system: System, links: LinkRows) -> bool:
+    """Whether only the number of agents matters whose data is held: like agents and equal links."""
+    return len(set(system.sensor_of)) == 1 and links.uniform and system.network.delays is None
+
+
 def number_of_paths(network: Network) -> int:
     """How many paths r_1 ≥ … ≥ r_k there are for like agents: C(n+k−1, k); on a ring those that fall by at most 1."""
     n, k = network.agents, network.steps
@@ -352,6 +358,11 @@ class LosslessFilter(NamedTuple):
     shared: bool
     error: np.ndarray | None = None
     numbers: Numbers = AsTheyAre()
+
+    @classmethod
+    def of(cls, system: System) -> LosslessFilter:
+        """Return the filter of a system's agents."""
+        return cls(system.model, system.sensors, system.P0, system.shared, system.error)
 
     def start(self, counts: np.ndarray) -> AlongPath:
         """Estimate from so many agents' initial ones, and what it leaves of the error."""

@@ -83,6 +83,8 @@ def sample_optimum(
     *,
     workers: int | None = None,
     most_bytes: int = MOST_BYTES,
+    paired: bool = False,
+    first: int = 0,
 ) -> OptimumSample:
     """Draw outcomes and follow the optimum in each.
 
@@ -92,6 +94,8 @@ def sample_optimum(
     runs, seed : size of the sample per row, and its seed; more runs of a seed begin with the fewer.
     workers : processes that share the work; default: one for small samples, else one per processor.
     most_bytes : memory that a block of runs may take; the sample does not depend on it.
+    paired : whether the arrivals are those of other estimators beyond `MOST_PAIRED` agents, too.
+    first : block of `stochfuse.engines.monte_carlo` that the sample begins with.
 
     Notes
     -----
@@ -100,17 +104,18 @@ def sample_optimum(
     d, n, K, rows = system.dimension, system.agents, system.steps, len(links.link)
     P = np.empty((rows, runs, K, n, d, d))
     bias = None if system.error is None else np.empty((rows, runs, K, n, d, 1))
-    drawn = _drawn(system, links)
+    paired = paired or n <= MOST_PAIRED
+    drawn = _drawn(system, links, paired)
     size = max(1, most_bytes // _bytes_of_a_run(system, max(map(len, drawn))))
-    source, stride = (_paired, BLOCK) if n <= MOST_PAIRED else (_own, size)
-    blocks = [(row, range(first, min(first + stride, runs))) for row in range(rows) for first in range(0, runs, stride)]
-    work = _Work(_Outcomes(system, drawn, seed), _Riccati(system), source, size)
+    source, stride = (_paired, BLOCK) if paired else (_own, size)
+    blocks = [(row, range(start, min(start + stride, runs))) for row in range(rows) for start in range(0, runs, stride)]
+    work = _Work(_Outcomes(system, drawn, seed, first), _Riccati(system), source, size)
     if workers is None:
         workers = len(os.sched_getaffinity(0)) if rows * runs * sum(map(len, drawn)) >= MANY else 1
-    for done, (row, first, now, left) in enumerate(_all_followed(work, blocks, min(workers, len(blocks))), start=1):
-        P[row, first : first + len(now)] = now
+    for done, (row, start, now, left) in enumerate(_all_followed(work, blocks, min(workers, len(blocks))), start=1):
+        P[row, start : start + len(now)] = now
         if bias is not None:
-            bias[row, first : first + len(now)] = left
+            bias[row, start : start + len(now)] = left
         listener().advance("sampling", done, len(blocks))
     return OptimumSample(P, bias)
 
@@ -160,11 +165,11 @@ def _follow(block: tuple[int, range]) -> Any:
     return _shared[0].follow(block)
 
 
-def _drawn(system: System, links: LinkRows) -> list[list[Event]]:
-    """Events of every step; beyond `MOST_PAIRED` agents without those that words of 32 bits never let come about."""
-    n, K = system.agents, system.steps
+def _drawn(system: System, links: LinkRows, paired: bool) -> list[list[Event]]:
+    """Events of every step; where not paired without those that words of 32 bits never let come about."""
+    K = system.steps
     drawn = [events(system.network, links, step) for step in range(1, K + 1 if links.varies else 2)]
-    if n > MOST_PAIRED:
+    if not paired:
         drawn = [_possible(now) for now in drawn]
     return drawn if links.varies else drawn * K
 
@@ -220,8 +225,8 @@ class _Links:
 class _Outcomes:
     """What outcomes are drawn from."""
 
-    def __init__(self, system: System, drawn: Sequence[list[Event]], seed: int) -> None:
-        self.system, self.drawn, self.seed = system, drawn, seed
+    def __init__(self, system: System, drawn: Sequence[list[Event]], seed: int, first: int) -> None:
+        self.system, self.drawn, self.seed, self.first = system, drawn, seed, first
         self.detections = [system.detections(step) for step in range(1, system.steps + 1)]
         different = {id(now): now for now in drawn}
         links = {key: _Links(now, system.agents) for key, now in different.items()}
@@ -230,7 +235,7 @@ class _Outcomes:
 
 def _paired(given: _Outcomes, row: int, block: range, size: int) -> Iterator[tuple[range, Iterator[_Arrivals]]]:
     """Some runs at a time of a block, with what becomes of each step, as `monte_carlo` draws it."""
-    random = stream(given.seed, row, block.start // BLOCK)
+    random = stream(given.seed, row, given.first + block.start // BLOCK)
     fates, missed = draw_fates(random, given.drawn, given.detections, (len(block), given.system.agents), row)
     for first in range(0, len(block), size):
         some = slice(first, first + size)
@@ -244,7 +249,7 @@ def _paired(given: _Outcomes, row: int, block: range, size: int) -> Iterator[tup
 
 def _own(given: _Outcomes, row: int, block: range, size: int) -> Iterator[tuple[range, Iterator[_Arrivals]]]:
     """All runs of a block, with what becomes of each step, every run from a stream of its own."""
-    yield block, _words_followed(given, row, [stream(given.seed, row, run) for run in block])
+    yield block, _words_followed(given, row, [stream(given.seed, row, given.first * BLOCK + run) for run in block])
 
 
 def _words_followed(given: _Outcomes, row: int, streams: Sequence[np.random.Generator]) -> Iterator[_Arrivals]:
@@ -431,7 +436,7 @@ class _Riccati:
         self.counted = len(system.sensors) <= MOST_COUNTED
         if not self.counted:
             self.J = self.J[:, kinds]
-        self.lossless = LosslessFilter(system.model, system.sensors, system.P0, system.shared, system.error)
+        self.lossless = LosslessFilter.of(system)
         self.precise = bool(suspects(system, Noises(P0=system.P0[None])).any())
 
     def blank(self, items: int) -> _Kept:

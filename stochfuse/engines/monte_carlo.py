@@ -43,6 +43,7 @@ class Experiment(NamedTuple):
     make : makes the estimator, and what to call for its numbers once all runs have been followed.
     of : makes what is kept of every estimate, a named tuple of arrays or Nones, of a stack of estimates.
     runs, seed : size of the sample per row, and its seed.
+    first : block that the sample begins with: those before are of an earlier sample that this one goes on with.
     """
 
     agents: int
@@ -52,6 +53,7 @@ class Experiment(NamedTuple):
     of: Callable[[Estimate], Any]
     runs: int
     seed: int
+    first: int = 0
 
 
 class Sample(NamedTuple):
@@ -249,7 +251,8 @@ def _runs_of(block: int, runs: int) -> int:
 def _draw(experiment: Experiment, row: int, block: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Fates and misses of a block, see `draw_fates`."""
     size = _runs_of(block, experiment.runs), experiment.agents
-    return draw_fates(stream(experiment.seed, row, block), experiment.events, experiment.detections, size, row)
+    random = stream(experiment.seed, row, experiment.first + block)
+    return draw_fates(random, experiment.events, experiment.detections, size, row)
 
 
 def stream(seed: int, row: int, number: int) -> np.random.Generator:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import log2
 from typing import Any
 
 import numpy as np
 
-from stochfuse.engines.events import events
 from stochfuse.errors import NoAnswerError, TooManyError, UsageError
 from stochfuse.kalman.metrics import Metric
-from stochfuse.prediction.predict import choose, predict
+from stochfuse.prediction.predict import EASY, EASY_EXCHANGE, choose, exchange_of, predict
 from stochfuse.prediction.quantities import QUANTITIES
 from stochfuse.prediction.result import Prediction
 from stochfuse.prediction.swept import Swept
@@ -20,7 +18,7 @@ from stochfuse.scenario.over import Over
 from stochfuse.scenario.over import over as read_over
 from stochfuse.scenario.registry import CHAIN, ESTIMATORS, GENERAL, METHODS, MONTE_CARLO, NAIVE, OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.result import Result
-from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario
+from stochfuse.scenario.scenario import Scenario, of_scenario
 
 DEFAULT_METHODS = (GENERAL, SIMPLIFIED, NAIVE, MONTE_CARLO)
 EXACT_FIRST = (GENERAL, OPTIMAL, SIMPLIFIED, NAIVE, MONTE_CARLO)
@@ -114,18 +112,24 @@ def compare(
     if over is not None:
         settings["over"] = read_over(scenario, over)
     settings = {"quantity": quantity, **settings}
+    if MONTE_CARLO not in methods and settings.get("precision") is not None:
+        raise UsageError(f"precision: expected {MONTE_CARLO} among the methods, got {', '.join(methods)}")
     return Comparison(tuple(_predict(scenario, link, method, settings) for method in ordered))
 
 
 def _predict(scenario: Scenario, link: Any, method: str, settings: dict[str, Any]) -> Prediction | Swept:
+    # what is compared with others is sampled, even where an exact engine would do
+    settings = {**settings, "exact_first": False}
+    if method != MONTE_CARLO:
+        settings = {name: value for name, value in settings.items() if name not in OF_SAMPLES}
     try:
         return predict(scenario, link, method, **settings)
     except UsageError as error:
         raise UsageError(f"{method} cannot be compared here, leave it out of the methods: {error}") from None
 
 
-EASY, EASY_EXCHANGE = 2000, 12
-"""Graphs, and binary logarithm of the outcomes of one exchange, up to which outcomes are enumerated unasked."""
+OF_SAMPLES = ("precision", "at_most", "control")
+"""Settings that exact engines refuse."""
 SIDE_BY_SIDE = ("claimed", "actual", "consistency")
 
 
@@ -169,7 +173,7 @@ def compare_estimators(
     ----------
     scenario, link : as for `predict`.
     estimators : names out of `stochfuse.prediction.predict.ESTIMATORS`; default: all that the scenario takes.
-    method : "general" or "monte-carlo"; default: exact where up to `EASY` graphs (or `max_graphs`) have to be carried
+    method : "general" or "monte-carlo"; default: exact where up to 2,000 graphs (or `max_graphs`) have to be carried
         and no runs are asked for, else sampled, with the same arrivals for all estimators.
     over : values of one or two numbers of the scenario by their paths, as for `predict`: the rows.
     quantities : what is to be compared; bias and rms make a note of an initial error that is not known.
@@ -220,16 +224,11 @@ def _estimated(
         return predict(scenario, link, method, quantity, estimator=estimator, **settings)
     easy = {"max_graphs": EASY, **settings}
     every = settings["over"].scenarios if "over" in settings else (scenario,)
-    exchange = max(_exchange(some, link) for some in every)
+    exchange = max(exchange_of(some, link) for some in every)
     if {"runs", "seed", "workers"} & set(settings) or exchange > EASY_EXCHANGE:
         return predict(scenario, link, MONTE_CARLO, quantity, estimator=estimator, **settings)
+    easy = {name: value for name, value in easy.items() if name not in OF_SAMPLES}
     try:
         return predict(scenario, link, GENERAL, quantity, estimator=estimator, **easy)
     except TooManyError:
         return predict(scenario, link, MONTE_CARLO, quantity, estimator=estimator, **settings)
-
-
-def _exchange(scenario: Scenario, link: Any) -> float:
-    """Binary logarithm of the outcomes of one exchange."""
-    network = scenario.network
-    return len(events(network, link_rows(scenario, link), 1)) * log2(len(network.delay) + 1)

@@ -79,7 +79,7 @@ def expected_states(
     link : link probabilities, one row each; default: those of the scenario.
     method : "simplified" (53), "general" (48) or "monte-carlo".
     **settings : estimator (of general and monte-carlo: what the agents do with what arrives), max_graphs, prune, runs,
-        seed and criterion, as for `predict`.
+        seed, control and criterion, as for `predict`.
 
     Returns
     -------
@@ -118,10 +118,9 @@ def expected_states(
         negligible = 1e-12 * (x**2).max(axis=(0, 1, 2))
         more = (np.sqrt(np.where(variance > negligible, variance, 0.0)), None)
     else:
-        drawn = states(scenario.system, rows, how, z)
-        sample = drawn.values.x[..., 0][drawn.which]
-        x, deviation = sample.mean(axis=1), sample.std(axis=1, ddof=1)
-        more = (deviation, deviation / np.sqrt(how.runs))
+        sample, terms = states(scenario.system, rows, how, z)
+        x, error = terms.mean(axis=1), terms.std(axis=1, ddof=1) / np.sqrt(how.runs)
+        more = (sample.std(axis=1, ddof=1), error)
     return ExpectedStates(
         scenario,
         method,
@@ -142,7 +141,10 @@ def _settings(method: str, given: Mapping[str, Any]) -> Settings:
             raise UsageError(f"{name}: no such setting{nearest(name, known)}; expected {', '.join(known)}")
     if method == SIMPLIFIED and given:
         raise UsageError(f"{next(iter(given))}: expected method {GENERAL} or {MONTE_CARLO}, got {method}")
-    return Settings(**given)
+    found = Settings(**given)
+    if found.precision is not None:
+        raise UsageError("precision: expected a quantity of the error, got states: use runs")
+    return found
 
 
 def _checked(scenario: Scenario, measurements: Any) -> np.ndarray:

@@ -7,14 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import inf
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from stochfuse.errors import UsageError
 from stochfuse.kalman.checks import covariance_fault, first_fault
-from stochfuse.kalman.metrics import Moments
-from stochfuse.scenario.registry import LFG
+from stochfuse.kalman.metrics import Metric, Moments
+from stochfuse.scenario.registry import LFG, OPTIMUM
 
 if TYPE_CHECKING:
     from stochfuse.prediction.general import Outcomes
@@ -22,6 +24,24 @@ if TYPE_CHECKING:
 
 MOST_GRAPHS = 100_000
 RUNS, SEED = 1000, 1
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What of a prediction will be looked at: what a precision is asked of.
+
+    Parameters
+    ----------
+    quantities : names; default: the one that is predicted.
+    metrics : numbers that are made of it; default: the scenario's metric, else the trace.
+    agent : "mean", "worst", "best" or a number from 1.
+    steps : which of them; default: all.
+    """
+
+    quantities: tuple[str, ...] = ()
+    metrics: tuple[Metric, ...] = ()
+    agent: int | str = "mean"
+    steps: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -37,6 +57,12 @@ class Settings:
     workers : monte-carlo: processes; default: one for small samples, else one per processor.
     criterion : covariance-intersection, split-ci: what the weights minimise, "det", "trace" or "max-eig",
         in each fusion by itself: over several steps that need not be the least.
+    control : monte-carlo: "optimum", the exact optimum as control variate wherever that helps, or "none".
+    precision : monte-carlo: draw until every standard error shown is below that share of its value, 0.002 or "0.2%",
+        in the place of `runs`; where an exact engine takes the scenario it is used.
+    at_most : with a precision: seconds after which no more is drawn, 60 or "60s"; the runs then depend on the machine.
+    exact_first : with a precision: whether an exact engine is used where it is cheap.
+    shown : with a precision: what of the prediction it is asked of.
     """
 
     estimator: str = LFG
@@ -46,6 +72,11 @@ class Settings:
     seed: int = SEED
     workers: int | None = None
     criterion: str = "det"
+    control: str = OPTIMUM
+    precision: float | str | None = None
+    at_most: float | str | None = None
+    exact_first: bool = True
+    shown: Shown = Shown()
 
 
 class Averaged(NamedTuple):
@@ -120,4 +151,41 @@ def faults_of(moments: Moments) -> dict[int, str]:
         for item, first in enumerate(map(first_fault, M)):
             if first is not None:
                 found.setdefault(item, f"the {name} covariance at step {first[0]} is {first[1]}")
+    return found
+
+
+def share(value: float | str) -> float:
+    """Return a precision as a share: of 0.002, "0.002" or "0.2%".
+
+    Raises
+    ------
+    UsageError
+        If it is none, or not between 0 and 1.
+    """
+    text = str(value).strip()
+    try:
+        found = float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
+    except ValueError:
+        found = 0.0
+    if not 0.0 < found < 1.0:
+        raise UsageError(f"precision: expected a share between 0 and 1, such as 0.2% or 0.002, got '{value}'")
+    return found
+
+
+def seconds(value: float | str) -> float:
+    """Return a time in seconds: of 60, "60s" or "2min".
+
+    Raises
+    ------
+    UsageError
+        If it is none, or not positive.
+    """
+    text = str(value).strip()
+    unit = next((u for u in ("min", "s", "h") if text.endswith(u)), "")
+    try:
+        found = float(text.removesuffix(unit)) * {"min": 60.0, "h": 3600.0}.get(unit, 1.0)
+    except ValueError:
+        found = 0.0
+    if not 0.0 < found < inf:
+        raise UsageError(f"at-most: expected a time such as 60s or 2min, got '{value}'")
     return found

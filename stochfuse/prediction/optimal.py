@@ -22,6 +22,7 @@ from stochfuse.engines.contact_chain import (
     TooManyPathsError,
     TooManyUnlikeError,
     by_counts,
+    by_number,
     check_size,
     contacts,
     expected_optimum,
@@ -158,24 +159,20 @@ def groups_of(system: System, links: LinkRows) -> tuple[tuple[int, ...], ...]:
     """Return the agents that are alike, whose optimum is the same."""
     require(system, links, OPTIMAL, CHAIN)
     network, kinds = system.network, system.sensor_of
-    if _alike(system, links):
+    if by_number(system, links):
         return (tuple(range(network.agents)),)
     return groups_alike(network, links, kinds, relabellings(network, links, kinds))
 
 
 def filter_of(system: System) -> LosslessFilter:
     """Return the filter of an agent that loses nothing."""
-    return LosslessFilter(system.model, system.sensors, system.P0, system.shared, system.error)
+    return LosslessFilter.of(system)
 
 
 def counted(system: System, links: LinkRows) -> bool:
     """Whether `number_of_paths` is that of the system's chain."""
     plain = system.network.delay == (1.0,) and links.bursts is None and system.detects is None
-    return plain and _alike(system, links)
-
-
-def _alike(system: System, links: LinkRows) -> bool:
-    return len(set(system.sensor_of)) == 1 and links.uniform and system.network.delays is None
+    return plain and by_number(system, links)
 
 
 def _paths_of(system: System, chain: Contacts) -> int:

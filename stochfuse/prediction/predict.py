@@ -12,14 +12,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
+from math import log2
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
+from stochfuse.engines.events import events
 from stochfuse.engines.precision import told
-from stochfuse.errors import StochfuseError, TooManyError, UsageError, nearest
+from stochfuse.errors import NoAnswerError, StochfuseError, TooManyError, UsageError, nearest
 from stochfuse.kalman.checks import covariance_fault
-from stochfuse.prediction.method import RUNS, Averaged, Settings, faults_of
+from stochfuse.kalman.metrics import metric as metric_of
+from stochfuse.prediction.method import RUNS, Averaged, Settings, Shown, faults_of, seconds, share
 from stochfuse.prediction.quantities import QUANTITIES
 from stochfuse.prediction.result import Prediction
 from stochfuse.prediction.swept import Swept, of_parts
@@ -28,6 +31,7 @@ from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.over import Over
 from stochfuse.scenario.over import over as read_over
 from stochfuse.scenario.registry import (
+    CONTROLS,
     CRITERIA,
     ESTIMATORS,
     GENERAL,
@@ -54,6 +58,10 @@ CENTRE = (
 NO_ERROR = "the scenario has no known initial error (initial.error): the bias is 0, the RMS error that of the noise"
 HARDNESS = ("claimed", OPTIMAL, "actual", "consistency", "bias", "rms")
 """The moments of the actual error contain what is claimed; bias and rms have more to note."""
+EASY, EASY_EXCHANGE = 2000, 12
+"""Graphs, and binary logarithm of the outcomes of one exchange, up to which outcomes are enumerated unasked."""
+PATIENT, EASILY = 5.0, 1 << 17
+"""Seconds of a limit of time that go with so many graphs, generously, and with so many outcomes of all of them."""
 WORTHLESS = 1e-3
 """Relative rounding beyond which it is no answer."""
 
@@ -152,6 +160,7 @@ def predict(
         method is None
         and scenario.method is None
         and settings.get("estimator") is not None
+        and settings.get("precision") is None
         and quantity != registry.OPTIMAL
     ):
         return _by_any(scenario, link, quantity, {**settings, "interval": interval})
@@ -161,6 +170,10 @@ def predict(
     if steady and quantity != "claimed":
         raise UsageError(f"steady: expected quantity claimed, got {quantity}")
     rows = link_rows(scenario, link)
+    if how.precision is not None and how.exact_first:
+        exactly = _exactly(scenario, link, how, quantity)
+        if exactly is not None:
+            return exactly
     found = _averaged(scenario.system, Items(rows), method, how, quantity)
     if found.faults:
         item, why = min(found.faults.items())
@@ -172,6 +185,36 @@ def predict(
         return prediction
     fixed = _room("steady_state").steady_state(scenario, rows)
     return prediction.with_steady(fixed.P, fixed.bound)
+
+
+def _exactly(scenario: Scenario, link: Any, how: Settings, quantity: str) -> Prediction | None:
+    """Predict by an exact engine what is asked to a precision, where that is easy within the time; else None."""
+    more = 1.0 if how.at_most is None else max(1.0, seconds(how.at_most) / PATIENT)
+    try:
+        if how.estimator == OPTIMAL:
+            found = predict(scenario, link, OPTIMAL, quantity)
+        else:
+            graphs = int(more * min(EASY, EASILY / 2.0 ** exchange_of(scenario, link)))
+            if not graphs:
+                return None
+            kept = {"estimator": how.estimator, "criterion": how.criterion, "max_graphs": graphs}
+            found = predict(scenario, link, GENERAL, quantity, **kept)
+    except (UsageError, NoAnswerError):
+        return None
+    if found.nature == "sampled":
+        return None
+    asked, reached = share(how.precision or 0.0), float(np.max(found.meta.get("relative_bound", 0.0)))
+    if reached > asked or found.nature == "approximate":
+        return None
+    told = f"precision: nothing had to be drawn, method {found.method} takes this scenario: {found.nature}"
+    meta = {**found.meta, "precision": {"asked": asked, "reached": reached}}
+    return replace(found, notes=(told, *found.notes), meta=meta)
+
+
+def exchange_of(scenario: Scenario, link: Any) -> float:
+    """Binary logarithm of the outcomes of one exchange."""
+    network = scenario.network
+    return len(events(network, link_rows(scenario, link), 1)) * log2(len(network.delay) + 1)
 
 
 def _supported(
@@ -206,6 +249,8 @@ def predict_several(
     if over is not None:
         return _swept(read_over(scenario, over), link, method, quantities, one_by_one, settings)
     method = registry.OPTIMAL if method == registry.CHAIN else method or scenario.method
+    if method is None and settings.get("precision") is not None:
+        method = MONTE_CARLO
     if method is None and settings.get("estimator") is None:
         method = registry.SIMPLIFIED
     together, apart = _together(method or "", quantities)
@@ -217,7 +262,8 @@ def predict_several(
     for some in (together, apart):
         if some:
             hardest = max(some, key=HARDNESS.index)
-            common = predict(scenario, link, method, hardest, **settings)
+            shown = replace(settings.get("shown", Shown()), quantities=tuple(some))
+            common = predict(scenario, link, method, hardest, **{**settings, "shown": shown})
             found |= {q: common if q == hardest else common.shown_as(q) for q in some}
     return [found[q] for q in quantities]
 
@@ -240,7 +286,8 @@ def _at_once(
     first = over.scenarios[0]
     way = method or first.method or (registry.SIMPLIFIED if settings.get("estimator") is None else None)
     # the answer to a sample depends on the company it is drawn in
-    if way in (None, MONTE_CARLO) or settings.get("prune") or settings.get("steady"):
+    sampled = way in (None, MONTE_CARLO) or settings.get("precision") is not None
+    if sampled or settings.get("prune") or settings.get("steady"):
         return None
     items = over.items(link)
     if items is None or len(over.scenarios) == 1:
@@ -408,7 +455,8 @@ def _together(method: str, quantities: Sequence[str]) -> tuple[list[str], list[s
 
 def _asked(scenario: Scenario, method: str | None, quantity: str, settings: Mapping[str, Any]) -> tuple[str, Settings]:
     """Method and settings of a request, checked."""
-    method = method or scenario.method or registry.SIMPLIFIED
+    precise = settings.get("precision") is not None
+    method = method or scenario.method or (MONTE_CARLO if precise else registry.SIMPLIFIED)
     choose("method", method, METHODS)
     choose("quantity", quantity, QUANTITIES)
     if method == registry.CHAIN:
@@ -424,9 +472,31 @@ def _asked(scenario: Scenario, method: str | None, quantity: str, settings: Mapp
     how = Settings(**{"estimator": scenario.estimator or LFG, "runs": scenario.runs or RUNS, **settings})
     choose("estimator", how.estimator, ESTIMATORS)
     choose("criterion", how.criterion, CRITERIA)
+    choose("control", how.control, CONTROLS)
+    _check_precision(method, how, settings)
+    shown = how.shown
+    if not shown.metrics:
+        shown = replace(shown, metrics=(metric_of(scenario.metric or "trace", scenario.model),))
+    how = replace(how, shown=shown if shown.quantities else replace(shown, quantities=(quantity,)))
     if quantity == OPTIMAL:
         method, how = (MONTE_CARLO if method == MONTE_CARLO else OPTIMAL), replace(how, estimator=OPTIMAL)
     return method, replace(how, estimator=NAIVE) if method == NAIVE else how
+
+
+def _check_precision(method: str, how: Settings, given: Mapping[str, Any]) -> None:
+    """Raise UsageError if a precision, or a limit of time, is none, or goes with nothing that is sampled."""
+    if how.at_most is not None:
+        seconds(how.at_most)
+        if how.precision is None:
+            raise UsageError(f"at-most: expected a precision to go with it, got {how.at_most} alone")
+    if given.get("control") is not None and method not in (MONTE_CARLO, OPTIMAL):
+        raise UsageError(f"control: expected method {MONTE_CARLO}, whose values are sampled, got {method}")
+    if how.precision is not None:
+        share(how.precision)
+        if method != MONTE_CARLO:
+            raise UsageError(f"precision: expected method {MONTE_CARLO}, whose values are sampled, got {method}")
+        if given.get("runs") is not None:
+            raise UsageError(f"runs: expected without precision, which says how many it takes, got {how.runs}")
 
 
 def _by_any(scenario: Scenario, link: Any, quantity: str, settings: Mapping[str, Any]) -> Prediction:
@@ -436,8 +506,9 @@ def _by_any(scenario: Scenario, link: Any, quantity: str, settings: Mapping[str,
     features = capabilities.features_of(scenario.system, link_rows(scenario, link))
     engines = capabilities.engine_for(name, features) or [registry.GENERAL]
     for engine in engines:
+        given = {n: v for n, v in settings.items() if n != "control" or engine == MONTE_CARLO}
         try:
-            found = predict(scenario, link, engine, quantity, **settings)
+            found = predict(scenario, link, engine, quantity, **given)
         except TooManyError:
             if engine == engines[-1]:
                 raise

@@ -168,13 +168,13 @@ class Prediction(Result):
         if self.sampled is None:
             return None
         m = metric(of, self.scenario.model) if isinstance(of, str) else of
-        groups = self.sampled.groups
+        groups = range(len(self.sampled.groups))
         if agent in ("worst", "best"):
-            each = np.stack([self.sampled.standard_error(m, group, self.quantity) for group in groups])
+            each = np.stack([self.sampled.standard_error(m, [group], self.quantity) for group in groups])
             values = value(self.quantity, m, self.moments)
             chosen = values.argmax(axis=-1) if agent == "worst" else values.argmin(axis=-1)
             return np.take_along_axis(each, chosen[None], axis=0)[0]
-        whom = sum(groups, ()) if agent == "mean" else groups[self._group(agent)]
+        whom = groups if agent == "mean" else [self._group(agent)]
         return self.sampled.standard_error(m, whom, self.quantity)
 
     def interval(self, of: str | Metric = "trace", agent: int | str = "mean") -> tuple[np.ndarray, np.ndarray] | None:

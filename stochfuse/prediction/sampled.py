@@ -3,30 +3,53 @@
 Standard errors are those of the mean over independent runs.  Agents that are alike are averaged within a run first;
 their errors are dependent, the runs are not.  For a metric that is not linear in the covariance the error is carried
 through by the metric's derivative at the mean (delta method), taken by central differences.
+
+Wherever it helps, the exact optimum is the sample's control variate (`stochfuse.prediction.control`).  How many runs a
+precision takes is found in `stochfuse.prediction.stopping`.
+
+Runs that all met one value say nothing of what they did not meet.  Where they are too few to have met more than the
+likeliest, the standard error is all the same not 0: of a sample with a control it is no less than the correction, what
+the exact optimum says of all that is missing; of a plain one, if it met one value only, no less than the value times
+1/runs, as if outcomes of that probability were off by as much as the value itself.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from stochfuse.engines.contact_sample import sample_optimum
-from stochfuse.engines.events import events, relabellings
+from stochfuse.engines.events import concerning, events, relabellings
 from stochfuse.engines.monte_carlo import Experiment, Sample, sample
 from stochfuse.errors import UsageError
 from stochfuse.estimators.making import make
 from stochfuse.estimators.protocol import Claims, Estimator
 from stochfuse.estimators.world import claimed_only, moments
 from stochfuse.kalman.metrics import Metric, Moments
+from stochfuse.kalman.metrics import metric as metric_of
+from stochfuse.prediction.control import (
+    KIND,
+    MOST_HELD,
+    WORTH,
+    Control,
+    Expected,
+    coefficients,
+    estimated,
+    expectation,
+    no_control,
+    optimum_of,
+)
 from stochfuse.prediction.general import groups_alike, spread
-from stochfuse.prediction.method import Averaged, Settings, group_of, joined
+from stochfuse.prediction.method import Averaged, Settings, Shown, group_of, joined, seconds, share
 from stochfuse.prediction.quantities import needed, value
+from stochfuse.prediction.stopping import Parts, sampled_to
 from stochfuse.scenario.network import LinkRows
-from stochfuse.scenario.registry import OPTIMAL
+from stochfuse.scenario.registry import NO_CONTROL, OPTIMAL, STAND_ALONE
 from stochfuse.scenario.system import Items, Noises, System
 
 MOST_AGENTS, MOST_NUMBERS = 60, 500_000_000
@@ -37,6 +60,8 @@ MANY = 10_000
 """Runs, over all rows, from which on another process pays for its start."""
 ROUNDING = 1e-13
 """Standard error, relative to the value, that is rounding in runs that are all alike."""
+SCARCE, MOST_REDUCED = 5, 1e9
+"""Runs unlike the rest that are too few to say how often that is; largest reduction of a variance that is told."""
 STEP = 1e-4
 """Share of a run's deviation from the mean over which the derivative of a metric is taken."""
 
@@ -49,10 +74,14 @@ class Sampled:
     ----------
     sample : different moments, and which of them each agent has in each run.
     groups : agents that are alike.
+    odds : (rows, steps, groups) probability that not just the likeliest becomes of what may reach a group at a step.
+    control : the optimum in every run; None where the sample is left as it is.
     """
 
     sample: Sample
     groups: tuple[tuple[int, ...], ...]
+    odds: np.ndarray
+    control: Control | None = None
 
     @property
     def runs(self) -> int:
@@ -65,28 +94,113 @@ class Sampled:
         shape = (index.shape[0], index.shape[2], len(self.groups))
         means = values.map(lambda m: np.empty((*shape, *m.shape[1:])))
         for row, step, g in np.ndindex(shape):
+            if self.control is not None:
+                of_runs, _ = self.control.corrected(self.in_runs(values, row, step, g), row, step, self.groups[g])
+                for mean, each in zip(means, of_runs, strict=True):
+                    if each is not None:
+                        mean[row, step, g] = each.mean(axis=0)
+                continue
             used, counts = np.unique(index[row, :, step][:, list(self.groups[g])], return_counts=True)
             for mean, each in zip(means, values, strict=True):
                 if each is not None:
                     mean[row, step, g] = np.tensordot(counts, each[used], axes=1) / counts.sum()
         return means
 
-    def standard_error(self, metric: Metric, agents: tuple[int, ...], quantity: str = "claimed") -> np.ndarray:
-        """Standard error of a quantity of the mean over some agents, (rows, steps)."""
+    def in_runs(self, values: Moments, row: int, step: int, group: int) -> Moments:
+        """Moments in every run, as they were drawn, averaged over a group of agents, (runs, …)."""
+        which = self.sample.which[row, :, step][:, list(self.groups[group])]
+        return values.map(lambda m: m[which].mean(axis=1))
+
+    def standard_error(self, metric: Metric, groups: Sequence[int], quantity: str = "claimed") -> np.ndarray:
+        """Standard error of a quantity of the mean over the agents of some groups, (rows, steps)."""
+        return self.judged(metric, groups, quantity)[1]
+
+    def judged(self, metric: Metric, groups: Sequence[int], quantity: str) -> tuple[np.ndarray, np.ndarray]:
+        """A quantity of the mean over the agents of some groups, and its standard error, each (rows, steps)."""
         values, index = needed(quantity, self.sample.values), self.sample.which
-        out = np.empty((index.shape[0], index.shape[2]))
-        for row in range(len(index)):
-            for step in range(index.shape[2]):
-                which = index[row, :, step][:, list(agents)]
-                runs = values.map(lambda m: m[which].mean(axis=1))  # noqa: B023
-                above, below = (
-                    value(quantity, metric, runs.map(lambda m: m.mean(axis=0) + h * (m - m.mean(axis=0))))  # noqa: B023
-                    for h in (STEP, -STEP)
+        of = partial(value, quantity, metric)
+        shown, out = np.empty((2, index.shape[0], index.shape[2]))
+        share = np.array([len(self.groups[g]) for g in groups]) / sum(len(self.groups[g]) for g in groups)
+        for row, step in np.ndindex(out.shape):
+            plain = [self.in_runs(values, row, step, g) for g in groups]
+            drawn, terms, moved = _averaged(plain, share), plain, None
+            if self.control is not None:
+                both = [
+                    self.control.corrected(p, row, step, self.groups[g]) for p, g in zip(plain, groups, strict=True)
+                ]
+                terms = [of_runs for of_runs, _ in both]
+                moved = [more for _, more in both if more is not None]
+            terms = _averaged(terms, share)
+            mean = terms.map(lambda m: m.mean(axis=0))
+            shown[row, step] = of(mean)
+            parts = [terms.map(lambda m: m - m.mean(axis=0)), *([_averaged(moved, share)] if moved else [])]
+            error = np.sqrt(sum(_spread(of, mean, deviations) for deviations in parts))
+            constant, rounding = all(_constant(m) for m in drawn), ROUNDING * np.abs(shown[row, step])
+            if constant or self.control is None:
+                error = error if error > rounding else 0.0
+            known = self.control is not None and self.control.expected.further is None
+            if any(self.scarce(row, step, g) for g in groups) and (constant or known):
+                error = max(error, self._unseen(of, mean, drawn))
+            if self.control is not None and not constant:
+                # what the control takes away whole is still known to rounding only
+                error = max(
+                    rounding, np.hypot(error, self.control.expected.bound[row, step] * np.abs(shown[row, step]))
                 )
-                slope = (above - below) / (2 * STEP)
-                error = np.sqrt((slope**2).sum() / (self.runs - 1) / self.runs)
-                out[row, step] = error if error > ROUNDING * np.abs(above).max() else 0.0
-        return out
+            out[row, step] = error
+        return shown, out
+
+    def scarce(self, row: int, step: int, group: int) -> bool:
+        """Whether hardly any run is expected to have met anything but the likeliest, where there is anything else."""
+        return 0.0 < self.odds[row, step, group] * self.runs < SCARCE
+
+    def _unseen(self, of: Callable[[Moments], np.ndarray], mean: Moments, drawn: Moments) -> float:
+        """Standard error of a value where hardly any run met anything but the likeliest."""
+        if self.control is None or self.control.expected.further is not None:
+            return float(np.abs(of(mean))) / self.runs
+        gap = float(np.abs(of(mean) - of(drawn.map(lambda m: m.mean(axis=0)))))
+        return gap if gap > ROUNDING * np.abs(of(mean)) else 0.0
+
+    def shown(self, system: System, what: Shown) -> tuple[np.ndarray, np.ndarray]:
+        """What will be looked at, and its standard errors, each (any,)."""
+        metrics = what.metrics or (metric_of("trace", system.model),)
+        everyone = range(len(self.groups))
+        if what.agent == "mean":
+            whom = [tuple(everyone)]
+        else:
+            whom = [(g,) for g in everyone if isinstance(what.agent, str) or what.agent - 1 in self.groups[g]]
+        steps = np.array(what.steps or range(1, system.steps + 1)) - 1
+        found = [
+            np.stack(self.judged(m, groups, q))[:, :, steps].reshape(2, -1)
+            for q in what.quantities
+            for m in metrics
+            for groups in whom
+        ]
+        values, errors = np.concatenate(found, axis=1)
+        return values, errors
+
+
+def _averaged(parts: Sequence[Moments], share: np.ndarray) -> Moments:
+    """Moments averaged over groups of agents."""
+    if len(parts) == 1:
+        return parts[0]
+    return Moments(
+        *(None if m[0] is None else np.tensordot(share, np.array(m), axes=1) for m in zip(*parts, strict=True))
+    )
+
+
+def _spread(of: Callable[[Moments], np.ndarray], mean: Moments, deviations: Moments) -> float:
+    """Variance of a value of a mean, from what each independent part deviates from it, (parts, …)."""
+    above, below = (
+        of(Moments(*(m if m is None else m + h * d for m, d in zip(mean, deviations, strict=True))))
+        for h in (STEP, -STEP)
+    )
+    slope = (above - below) / (2 * STEP)
+    return float((slope**2).sum() / (len(slope) - 1) / len(slope))
+
+
+def _constant(m: np.ndarray | None) -> bool:
+    """Whether all runs met the same, but for rounding."""
+    return m is None or bool((np.abs(m - m[0]) <= ROUNDING * np.abs(m).max()).all())
 
 
 def averaged(system: System, items: Items, how: Settings, errors: bool) -> Averaged:
@@ -99,7 +213,7 @@ def averaged(system: System, items: Items, how: Settings, errors: bool) -> Avera
     """
     parts = []
     for members, alone, some in items.by_noises(system):
-        found = sampled(alone, some.links, how, errors=errors)
+        found, notes, meta = sampled(alone, some.links, how, errors=errors)
         parts.append(
             (
                 members,
@@ -109,20 +223,23 @@ def averaged(system: System, items: Items, how: Settings, errors: bool) -> Avera
                     natures=np.full(len(some), "sampled"),
                     estimator=how.estimator,
                     rounding=np.zeros(len(some)),
+                    notes=notes if items.noises.common else (),
                     sampled=found,
-                    meta={"runs": how.runs, "seed": how.seed},
+                    meta={"runs": found.runs, "seed": how.seed, **meta},
                 ),
             )
         )
     return joined(parts)
 
 
-def sampled(system: System, links: LinkRows, how: Settings, *, errors: bool = False) -> Sampled:
-    """Draw a sample of an estimator's estimates.
+def sampled(
+    system: System, links: LinkRows, how: Settings, *, errors: bool = False
+) -> tuple[Sampled, tuple[str, ...], dict[str, Any]]:
+    """Draw a sample of an estimator's estimates; also what to say of it, to readers and to programs.
 
     Parameters
     ----------
-    how : runs, seed, workers and estimator.
+    how : runs or precision, seed, workers, estimator and control.
     errors : whether the moments of the actual error are wanted too.
 
     Raises
@@ -130,36 +247,157 @@ def sampled(system: System, links: LinkRows, how: Settings, *, errors: bool = Fa
     UsageError
         If runs, seed or workers are out of range.
     """
+    shown = how.shown if how.shown.quantities else replace(how.shown, quantities=("actual" if errors else "claimed",))
     _check(system, links, how)
     network, kinds = system.network, system.labels
     permutations = relabellings(network, links, kinds)
     groups = groups_alike(network, links, kinds, permutations)
-    if how.estimator == OPTIMAL and network.agents > FEW:
-        return _optimum(system, links, how, groups, errors)
-    return Sampled(_drawn(system, links, how, permutations, errors=errors), groups)
+    odds = _odds(system, links, groups, how.estimator)
+
+    def draw(before: Sample | None, runs: int, first: int) -> Sample:
+        now = replace(how, runs=runs)
+        if how.estimator == OPTIMAL and network.agents > FEW:
+            return _extended(before, _optimum(system, links, now, first, errors))
+        return _extended(before, _drawn(system, links, now, permutations, first=first, errors=errors))
+
+    def judge(drawn: Sample, parts: Parts) -> tuple[tuple[Sampled, str, Reduced], float]:
+        found = helped(system, links, how, Sampled(drawn, groups, odds), parts, shown)
+        values, error = found[0].shown(system, shown)
+        there = error > 0
+        return found, float((error[there] / np.abs(values[there])).max()) if there.any() else 0.0
+
+    if how.precision is None:
+        (found, said, control), _ = judge(draw(None, how.runs, 0), [(how.runs, 0)])
+        return found, tuple(filter(None, (said, *rare(system, links, found)))), {"control": control._asdict()}
+    numbers = len(links.link) * system.steps * system.agents
+    most = min(MOST_NUMBERS // numbers, MOST_HELD // numbers // system.dimension**2)
+    limit = None if how.at_most is None else seconds(how.at_most)
+    (found, said, control), reached = sampled_to(share(how.precision), limit, most, draw, judge)
+    meta = {"control": control._asdict(), "precision": {"asked": reached.asked, "reached": reached.reached}}
+    told = f"precision {100 * reached.reached:.2g} % of each value after {found.runs:,} runs"
+    told += f", {100 * reached.asked:.3g} % asked for: {reached.stopped}" if reached.stopped else ""
+    return found, tuple(filter(None, (told, said, *rare(system, links, found)))), meta
 
 
-def states(system: System, links: LinkRows, how: Settings, records: np.ndarray) -> Sample:
+class Reduced(NamedTuple):
+    """What a control does, for programs.
+
+    Parameters
+    ----------
+    kind : of the control.
+    variance_reduction : variance of what is shown without it over that with it.
+    expected : whether its expectation is "exact" or "estimated"; None without a control.
+    """
+
+    kind: str = NO_CONTROL
+    variance_reduction: float = 1.0
+    expected: str | None = None
+
+
+def helped(
+    system: System, links: LinkRows, how: Settings, plain: Sampled, parts: Parts, shown: Shown
+) -> tuple[Sampled, str, Reduced]:
+    """Correct a sample by the optimum where that helps; also what to say of it."""
+    how = replace(how, runs=plain.runs)
+    why = no_control(system, links, how)
+    if why is not None or not plain.odds.any():
+        return plain, f"control: none; {why}" if why else "", Reduced()
+    runs, expected = optimum_of(system, links, how, parts), expectation(system, links)
+    # of an unknown expectation as if it were the sample's mean, to see whether further runs are worth their time
+    own = Expected(runs.map(lambda m: m.mean(axis=1)), np.zeros(plain.odds.shape[:2]))
+    found = replace(plain, control=Control(runs, expected or own))
+    reduction = _reduction(plain, found, system, shown)
+    if expected is None and reduction >= WORTH:
+        expected = estimated(system, links, how, 1.0 - 1.0 / reduction)
+        found = replace(plain, control=Control(runs, expected))
+        reduction = _reduction(plain, found, system, shown)
+    if reduction == 0.0:  # nothing is uncertain
+        return plain, "", Reduced()
+    if reduction < WORTH or expected is None:
+        why = f"the exact optimum takes away too little of the variance (1/{reduction:.2f})"
+        return plain, f"control: none; {why}", Reduced()
+    known = "exact" if expected.further is None else "estimated"
+    by = "" if known == "exact" else f"; its mean from {expected.runs:.3g} times as many runs of its own"
+    told = f"1/{float(f'{reduction:.3g}'):,g}" if reduction < 1e6 else "less than a millionth"
+    return found, f"control: {KIND}; variance {told}{by}", Reduced(KIND, min(reduction, MOST_REDUCED), known)
+
+
+def _reduction(plain: Sampled, found: Sampled, system: System, shown: Shown) -> float:
+    """Variance of what is shown, relative to its values, without a control over that with it; 0 of none."""
+    (values, error), (_, less) = plain.shown(system, shown), found.shown(system, shown)
+    there = (error > 0) & (values != 0)
+    before, after = (((e[there] / values[there]) ** 2).sum() for e in (error, less))
+    return 0.0 if before == 0 else float(before / max(after, before / MOST_REDUCED))
+
+
+def _odds(system: System, links: LinkRows, groups: Sequence[Sequence[int]], estimator: str) -> np.ndarray:
+    """Probability that not just the likeliest becomes of what may reach groups at a step, (rows, steps, groups)."""
+    likeliest = np.ones((len(links.link), system.steps, len(groups)))
+    for step in range(1, system.steps + 1):
+        drawn = [] if estimator == STAND_ALONE else events(system.network, links, step)
+        for g, group in enumerate(groups):
+            for event in concerning(drawn, group):
+                likeliest[:, step - 1, g] *= np.maximum(1.0 - event.probability, event.probability * max(event.delay))
+            for agent, p in system.detections(step):
+                likeliest[:, step - 1, g] *= max(p, 1.0 - p) if agent in group else 1.0
+    return np.where(likeliest < 1.0, 1.0 - likeliest, 0.0)
+
+
+def rare(system: System, links: LinkRows, found: Sampled) -> list[str]:
+    """What to say of steps at which nearly all runs met one value: what is rarer than they are many may be missing."""
+    said, claimed = [], Moments(found.sample.values.P)
+    for row, µ in enumerate(links.means(system.network)):
+        others = [
+            found.runs - np.unique(np.round(traces / np.abs(traces).max(), 12), return_counts=True)[1].max()
+            for step, g in np.ndindex(found.odds.shape[1:])
+            if found.scarce(row, step, g)
+            for traces in [np.trace(found.in_runs(claimed, row, step, g).P, axis1=-2, axis2=-1)]
+        ]
+        if others and min(others) < SCARCE:
+            met = "one value" + (f" but for {min(others)}" if min(others) else "")
+            said.append(
+                f"µ = {µ:.6g}: at some step all {found.runs:,} runs met {met}; outcomes of a probability of up to "
+                f"{3.0 / found.runs:.2g} together may be missing"
+            )
+    return said
+
+
+def _extended(before: Sample | None, more: Sample) -> Sample:
+    """A sample with further runs of every row."""
+    if before is None:
+        return more
+    columns = zip(before.values, more.values, strict=True)
+    values = type(more.values)(*(None if a is None else np.concatenate([a, b]) for a, b in columns))
+    return Sample(values, np.concatenate([before.which, more.which + len(before.values[0])], axis=1))
+
+
+def states(system: System, links: LinkRows, how: Settings, records: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Draw a sample of an estimator's estimates given what was measured, whatever sensors might have missed.
 
     Parameters
     ----------
-    how : runs, seed, workers and estimator.
+    how : runs, seed, workers, estimator and control.
     records : (steps, agents, p) measurements.
 
     Returns
     -------
-    Sample
-        Of `stochfuse.prediction.general.Spread`.
-
-    Raises
-    ------
-    UsageError
-        If runs, seed or workers are out of range.
+    x, terms : ndarray
+        (rows, runs, steps, agents, d) estimates, and what they are corrected to by the variances of the optimum where
+        these are known exactly; their mean and its standard error are those of the expected estimate.
     """
     _check(system, links, how)
     permutations = relabellings(system.network, links, range(system.agents))
-    return _drawn(system, links, how, permutations, records=records)
+    drawn = _drawn(system, links, how, permutations, records=records)
+    x = drawn.values.x[..., 0][drawn.which]
+    expected = None if no_control(system, links, how) is not None else expectation(system, links)
+    if expected is None:
+        return x, x
+    # variances say of an estimate only how it hangs together with them: there is no usual coefficient
+    of, mean = (
+        np.diagonal(P, axis1=-2, axis2=-1) for P in (optimum_of(system, links, how, [(how.runs, 0)]).P, expected.mean.P)
+    )
+    off = of - mean[:, None]
+    return x, np.stack([x[r] - coefficients(x[r], off[r], 0.0) * off[r] for r in range(len(x))])
 
 
 def _check(system: System, links: LinkRows, how: Settings) -> None:
@@ -186,6 +424,7 @@ def _drawn(
     how: Settings,
     permutations: list[tuple[int, ...]],
     *,
+    first: int = 0,
     errors: bool = False,
     records: np.ndarray | None = None,
 ) -> Sample:
@@ -200,6 +439,7 @@ def _drawn(
         of=spread if records is not None else moments if errors else claimed_only,
         runs=how.runs,
         seed=how.seed,
+        first=first,
     )
     workers = how.workers
     if workers is None:
@@ -207,9 +447,7 @@ def _drawn(
     return sample(experiment, rows, workers=workers)
 
 
-def _optimum(
-    system: System, links: LinkRows, how: Settings, groups: tuple[tuple[int, ...], ...], errors: bool
-) -> Sampled:
+def _optimum(system: System, links: LinkRows, how: Settings, first: int, errors: bool) -> Sample:
     """Sample the optimum by Boolean products: nearly every history of many agents has a value of its own."""
     n, d, steps, rows = system.agents, system.dimension, system.steps, len(links.link)
     entries = how.runs * rows * steps * n * d**2
@@ -218,14 +456,13 @@ def _optimum(
             f"runs: {how.runs} runs for {rows} link probabilities, {steps} steps and {n} agents of {d} states are "
             f"{entries:.3g} entries of covariances; expected at most {MOST_ENTRIES:.3g}"
         )
-    found = sample_optimum(system, links, how.runs, how.seed, workers=how.workers)
+    found = sample_optimum(system, links, how.runs, how.seed, workers=how.workers, first=first)
     P = found.P.reshape(-1, d, d)
     values = Moments(P)
     if errors:
         bias = np.zeros((len(P), d, 1)) if found.bias is None else found.bias.reshape(-1, d, 1)
         values = Moments(P, P, bias, P + bias @ np.swapaxes(bias, -1, -2))
-    which = np.arange(len(P), dtype=np.int32).reshape(found.P.shape[:4])
-    return Sampled(Sample(values, which), groups)
+    return Sample(values, np.arange(len(P), dtype=np.int32).reshape(found.P.shape[:4]))
 
 
 def _made(

@@ -7,6 +7,7 @@ differ in agents, steps and state: what a part does not have is not-a-number.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
@@ -26,6 +27,12 @@ from stochfuse.scenario.scenario import Scenario
 T = TypeVar("T")
 Answer = TypeVar("Answer")
 _NATURES: list[str] = list(NATURES)
+
+
+def _to(first: str, last: str) -> str:
+    """Two texts that differ in words as one."""
+    pairs = zip(first.split(" "), last.split(" "), strict=True)
+    return " ".join(a if a == b else f"{a} … {b}" for a, b in pairs)
 
 
 def below_each_other(given: Sequence[np.ndarray], fill: float = np.nan) -> np.ndarray:
@@ -120,7 +127,12 @@ class Swept(Result):
     @property
     def notes(self) -> tuple[str, ...]:
         """What the reader should know, each sentence once."""
-        return tuple(dict.fromkeys(note for part in self.parts for note in part.notes))
+        found: dict[str, list[str]] = {}
+        for note in (note for part in self.parts for note in part.notes):
+            # what a sample came to differs from point to point: the first and the last are told
+            of_sample = note.startswith(("control: ", "precision "))
+            found.setdefault(re.sub(r"\d[\d,.e+-]*", "#", note) if of_sample else note, []).append(note)
+        return tuple(_to(texts[0], texts[-1]) for texts in found.values())
 
     @property
     def forms(self) -> tuple[str, ...]:

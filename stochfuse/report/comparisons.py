@@ -100,7 +100,7 @@ def _error(view: ComparisonView, method: int, row: int, step: int) -> str:
     if errors is None:
         return ""
     scale = 100.0 / view.values()[0, row, step] if view.relative and method else 1.0
-    return f" ±{scale * errors[row, step]:.2g}"
+    return f" {predictions.plus_minus(scale * errors[row, step], scale * view.values()[method, row, step])}"
 
 
 def compare_csv(view: ComparisonView) -> str:
@@ -308,7 +308,11 @@ def estimator_table(view: EstimatorView) -> Table:
             for estimator, values, errors in zip(view.comparison.estimators, view.values, view.errors, strict=True):
                 cells = [
                     number(value[i, k], view.digits)
-                    + ("" if error is None or quantity == "consistency" else f" ±{error[i, k]:.2g}")
+                    + (
+                        ""
+                        if error is None or quantity == "consistency"
+                        else f" {predictions.plus_minus(error[i, k], value[i, k])}"
+                    )
                     for quantity, value, error in zip(view.quantities, values, errors, strict=True)
                 ]
                 step = (str(first.steps[k]),) if stepwise else ()

@@ -38,6 +38,10 @@ TERMS = {
         "A mean over drawn outcomes; ± is one standard error, the next sample's mean lies within two of "
         "them in 95 % of all cases."
     ),
+    "control variate": (
+        "What is drawn along with a sampled value and has a known mean: by what its own sample is off, the value is "
+        "corrected. Here the exact optimum of every outcome; see --control and --precision."
+    ),
     "pedigree": (
         "Of an estimate: the set of measurements and first estimates that went into it. What two "
         "pedigrees have in common must be counted once."

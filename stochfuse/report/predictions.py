@@ -37,6 +37,8 @@ STATISTICS = {
     "derivative": "derivative in µ of the expected {what}",
 }
 LEVEL = 0.95
+NOTHING = 1e-12
+"""Standard error, relative to the value, that is rounding."""
 WIDTH_95 = 1.959963984540054
 """Half-width of a 95 % confidence interval in standard errors."""
 
@@ -282,12 +284,18 @@ def predict_table(view: PredictionView) -> Table:
     for i, there in enumerate(view.there):
         shown = [number(v, view.digits) for v in values[i]]
         if errors is not None:
-            shown = [f"{value} ±{error:.2g}" for value, error in zip(shown, errors[i], strict=True)]
+            told = map(plus_minus, errors[i], values[i])
+            shown = [f"{value} {error}" for value, error in zip(shown, told, strict=True)]
         if ends is not None:
             shown = [f"{value} {_between(*pair, view.digits)}" for value, *pair in zip(shown, *(e[i] for e in ends))]  # noqa: B905
         shown = [value if is_there else "" for value, is_there in zip(shown, there, strict=True)]
         rows.append((*view.rows.cells(i), *shown, *([] if steady is None else [number(steady[i], view.digits)])))
     return Table((view.what, view.whom, view.how), view.rows.keys, tuple(columns), tuple(rows), over="k")
+
+
+def plus_minus(error: float, value: float) -> str:
+    """A standard error for people; what is no more than rounding is nothing."""
+    return f"±{error if abs(error) > NOTHING * abs(value) else 0.0:.2g}"
 
 
 def _between(low: float, high: float, digits: int) -> str:

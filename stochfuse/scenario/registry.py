@@ -281,6 +281,9 @@ STATISTIC = (
 )
 CRITERIA = ("det", "trace", "max-eig")
 """What the weights of an intersection minimise."""
+OPTIMUM, NO_CONTROL = "optimum", "none"
+CONTROLS = (OPTIMUM, NO_CONTROL)
+"""What a sample is corrected by."""
 NATURES = ("exact", "sampled", "bound", "approximate")
 """What numbers may be, the most certain first."""
 

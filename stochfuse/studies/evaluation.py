@@ -16,6 +16,8 @@ import numpy as np
 from stochfuse.engines.precision import told
 from stochfuse.errors import NoAnswerError, ScenarioError, StochfuseError, TooManyError
 from stochfuse.kalman.checks import LARGEST, covariance_fault, first_fault
+from stochfuse.prediction.compare import OF_SAMPLES
+from stochfuse.prediction.method import Shown
 from stochfuse.prediction.predict import WORTHLESS, predict_items, predict_several
 from stochfuse.prediction.result import Prediction
 from stochfuse.questions.messages import message_load
@@ -178,6 +180,8 @@ def _group(plan: Plan, values: Mapping[str, Any], numbers: Mapping[str, np.ndarr
     keys = {path: value for path, value in values.items() if path not in SETTINGS}
     settings = {**plan.settings, **{name: value for name, value in values.items() if name in SETTINGS}}
     method = settings.pop("method", None) or default_method(plan.example, set(settings))
+    if method != MONTE_CARLO:
+        settings = {name: value for name, value in settings.items() if name not in OF_SAMPLES}
     kind = (method, "", "")
     try:
         mapping = put(plan.base, keys)
@@ -303,7 +307,8 @@ def _several(asked: _Points, scenario: Scenario, items: np.ndarray) -> bool:
         # what the optimum claims is the optimum
         names = [OPTIMAL if asked.method == OPTIMAL and q == "claimed" else q for q in asked.quantities]
         different = list(dict.fromkeys(names))
-        several = predict_several(scenario, links, asked.method, different, **asked.settings)
+        shown = Shown(metrics=tuple(map(asked.plan.metric, asked.plan.metrics)), agent=asked.plan.agent)
+        several = predict_several(scenario, links, asked.method, different, **{**asked.settings, "shown": shown})
         found = [several[different.index(name)] for name in names]
         _fill(asked, found, items, rows)
     except Exception as error:

@@ -24,6 +24,7 @@ from stochfuse.prediction.quantities import unit as unit_of
 from stochfuse.scenario.checker import Checker
 from stochfuse.scenario.over import put
 from stochfuse.scenario.registry import (
+    CONTROLS,
     CRITERIA,
     ESTIMATORS,
     GENERAL,
@@ -83,6 +84,8 @@ class PredictTable(StrictTable):
     criterion: Literal[CRITERIA] | None = None  # type: ignore[valid-type]
     runs: int | None = Field(None, ge=2, strict=True)
     seed: int | None = Field(None, ge=0, strict=True)
+    precision: float | str | None = Field(None, description="share of every value, 0.002 or 0.2%, in place of runs")
+    control: Literal[CONTROLS] | None = None  # type: ignore[valid-type]
     max_graphs: int | None = Field(None, ge=1, strict=True)
     prune: bool | None = Field(None, strict=True)
 
@@ -265,7 +268,7 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-SETTINGS = ("method", "estimator", "criterion", "runs", "seed", "max_graphs", "prune")
+SETTINGS = ("method", "estimator", "criterion", "runs", "seed", "precision", "control", "max_graphs", "prune")
 """Names in [vary] that are no scenario keys."""
 MESSAGES, NODES = "messages", "messages.nodes"
 ERROR = ".standard_error"
@@ -409,4 +412,4 @@ def default_method(scenario: Scenario, given: set[str]) -> str:
     """Return the method where none is named: the scenario's, or the one that what is named belongs to."""
     if scenario.method is not None:
         return scenario.method
-    return MONTE_CARLO if "runs" in given else GENERAL if "estimator" in given else SIMPLIFIED
+    return MONTE_CARLO if {"runs", "precision"} & given else GENERAL if "estimator" in given else SIMPLIFIED

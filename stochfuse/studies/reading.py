@@ -38,16 +38,17 @@ from stochfuse import __version__
 from stochfuse.errors import Problem, ScenarioError, StochfuseError, UsageError
 from stochfuse.kalman.checks import shown
 from stochfuse.kalman.metrics import metric as metric_of
+from stochfuse.prediction.method import share
 from stochfuse.prediction.quantities import QUANTITIES
 from stochfuse.prediction.quantities import check as check_quantity
 from stochfuse.scenario.checker import Checker
 from stochfuse.scenario.over import KEY, PATH, put
-from stochfuse.scenario.registry import CRITERIA, ESTIMATORS, METHODS
+from stochfuse.scenario.registry import CONTROLS, CRITERIA, ESTIMATORS, METHODS
 from stochfuse.scenario.scenario import Scenario, folder_of, is_preset, parse, read_file, read_text, with_links
 from stochfuse.scenario.schema import problems_of, structure_problems
 from stochfuse.studies.plan import EXPECTED, MESSAGES, SETTINGS, Axis, Plan, StudyFile, read_axes
 
-_WORDS = {"method": METHODS, "estimator": ESTIMATORS, "criterion": CRITERIA}
+_WORDS = {"method": METHODS, "estimator": ESTIMATORS, "criterion": CRITERIA, "control": CONTROLS}
 _LEAST = {"runs": 2, "seed": 0, "max_graphs": 1}
 MOST_POINTS = 1_000_000_000
 MOST_DRAWN = 20_000_000
@@ -140,6 +141,8 @@ def _built(record: Mapping[str, Any], name: str) -> Plan:
     base = record["study"]["scenario"]
     example = _example(name, base, axes)
     settings = {key: value for key, value in given.predict.model_dump().items() if value is not None}
+    if "precision" in settings:
+        _check_share(check, "predict.precision", settings["precision"])
     for key in set(settings) & {axis.name for axis in axes}:
         check.note(f"predict.{key}", "nothing, since it is varied", shown(settings[key]))
     varied = {axis.name for axis in axes}
@@ -189,11 +192,21 @@ def _check_settings(check: Checker, axes: tuple[Axis, ...]) -> None:
             least = _LEAST[axis.name]
             if axis.kind != "int" or min(axis.given or (axis.low,)) < least:
                 check.note(path, f"whole numbers of at least {least}", shown(min(axis.given or (axis.low,), key=str)))
+        elif axis.name == "precision":
+            for given in axis.given or (axis.low,):
+                _check_share(check, path, given)
         elif axis.name == "prune":
             if not all(isinstance(v, bool) for v in axis.given or (axis.low,)):
                 check.note(path, "true or false", shown((axis.given or (axis.low,))[0]))
         elif "." not in axis.name or not PATH.fullmatch(axis.name):
             check.note(path, f"{KEY}, or one of {', '.join(SETTINGS)}", f"'{axis.name}'")
+
+
+def _check_share(check: Checker, path: str, given: Any) -> None:
+    try:
+        share(given)
+    except UsageError:
+        check.note(path, "a share between 0 and 1, such as 0.2% or 0.002", shown(given))
 
 
 def _size(check: Checker, axes: tuple[Axis, ...], kind: str, points: int | None) -> int:

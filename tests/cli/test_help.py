@@ -39,7 +39,7 @@ def test_rare_options_are_under_help_all():
     for flag in ("--prune", "--digits", "--workers", "--normalise"):
         assert flag not in short
         assert flag in long
-    assert "Show 8 more options" in short
+    assert "Show 10 more options" in short
     assert short.count("\n") < long.count("\n")
 
 

@@ -39,7 +39,7 @@ def test_standard_errors_are_honest():
     exact = sf.predict(scenario, [0.4], method="general").values()
     z = []
     for seed in range(60):
-        p = sf.predict(scenario, [0.4], method="monte-carlo", runs=300, seed=seed)
+        p = sf.predict(scenario, [0.4], method="monte-carlo", runs=300, seed=seed, control="none")
         z.append((p.values() - exact) / p.standard_error())
     z = np.array(z)[:, 0]
     assert (np.abs(z.mean(axis=0)) < 4 / np.sqrt(60)).all()
@@ -50,7 +50,8 @@ def test_standard_errors_are_honest():
 def test_errors_of_any_metric(metric):
     """The delta method against the spread of the metric of the mean over many small samples."""
     scenario = sf.load_scenario("cv-2d", steps=2)
-    samples = [sf.predict(scenario, [0.5], method="monte-carlo", runs=400, seed=s) for s in range(40)]
+    plain = {"method": "monte-carlo", "runs": 400, "control": "none"}
+    samples = [sf.predict(scenario, [0.5], seed=s, **plain) for s in range(40)]
     spread = np.std([p.values(metric) for p in samples], axis=0, ddof=1)
     claimed = np.mean([p.standard_error(metric) for p in samples], axis=0)
     np.testing.assert_allclose(claimed, spread, rtol=0.45)

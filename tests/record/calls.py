@@ -121,14 +121,14 @@ def _predictions() -> Iterator[tuple[str, Callable[[], Any]]]:
         return {"values": p.values(of, agent), "covariance": p.covariance, "nature": p.nature}
 
     for name, method in product([*SCENARIOS, *PRESETS], METHODS):
-        more = {"runs": 60} if method == "monte-carlo" else {}
+        more = {"runs": 60, "control": "none"} if method == "monte-carlo" else {}
         for quantity in ("claimed", "actual"):
             yield f"predict {name} {method} {quantity}", lambda a=(name, method, quantity), m=more: shown(*a, **m)
     for name, quantity in product(("scalar error", "planar error", "unlike", "matrix"), QUANTITIES):
         for method in METHODS[:4]:
             yield f"quantity {name} {method} {quantity}", lambda a=(name, method, quantity): shown(*a)
     for name, estimator in product([*SCENARIOS, "beacon-map", "cooperative-pnt", "parallel-filters"], ESTIMATORS):
-        for method, more in (("general", {}), ("monte-carlo", {"runs": 40})):
+        for method, more in (("general", {}), ("monte-carlo", {"runs": 40, "control": "none"})):
             label = f"estimator {name} {estimator} {method}"
             quantity = "actual" if method == "general" else "claimed"
             yield label, lambda a=(name, method, quantity), e=estimator, m=more: shown(*a, estimator=e, **m)
@@ -269,7 +269,9 @@ def _lines() -> Iterator[tuple[str, Callable[[], Any]]]:
     ]  # fmt: skip
     lines += [f"scenario show {p}" for p in PRESETS]
     for line in lines:
-        yield line, partial(command, *line.split())
+        # 0.1 had no control for its samples
+        plain = ["--control", "none"] if "--runs" in line and not line.startswith("messages") else []
+        yield line, partial(command, *line.split(), *plain)
 
 
 STUDY = """
@@ -298,7 +300,12 @@ def _files() -> Iterator[tuple[str, Callable[[], Any]]]:
         ("thesis-transient", "method = ['simplified', 'general', 'optimal', 'naive']", "", '["claimed"]'),
         ("cv-2d", "'network.steps' = [2, 3]", "method = 'general'", '["claimed", "actual", "messages"]'),
         ("thesis-steady", "estimator = ['covariance-intersection', 'split-ci']", "method = 'general'", '["actual"]'),
-        ("thesis-transient", "'network.steps' = [2, 3]", "method = 'monte-carlo'\nruns = 30", '["claimed"]'),
+        (
+            "thesis-transient",
+            "'network.steps' = [2, 3]",
+            "method = 'monte-carlo'\nruns = 30\ncontrol = 'none'",
+            '["claimed"]',
+        ),
         ("thesis-transient", "'initial.P' = [1.0, 100.0]", "method = 'simplified'", '["claimed", "rms"]'),
     ]
     for i, parts in enumerate(studies):
