@@ -15,12 +15,12 @@ from dataclasses import replace
 import numpy as np
 
 from stochfuse.engines.contact_chain import (
-    MOST_UNLIKE,
+    MOST_STATES,
     Chain,
     Contacts,
     LosslessFilter,
     TooManyPathsError,
-    TooManyUnlikeError,
+    TooManyStatesError,
     by_counts,
     check_size,
     contacts,
@@ -60,7 +60,7 @@ def averaged(system: System, items: Items, how: Settings, errors: bool) -> Avera
     groups = groups_of(system, links)
     try:
         chain = contacts(network, links, system.sensor_of, groups, system.detects)
-    except TooManyUnlikeError:
+    except TooManyStatesError:
         return _sampled(system, items, how, errors)
     paths = number_of_paths(network) if counted(system, links) else None
     try:
@@ -88,9 +88,9 @@ def averaged(system: System, items: Items, how: Settings, errors: bool) -> Avera
 
 
 def _sampled(system: System, items: Items, how: Settings, errors: bool) -> Averaged:
-    """Sample the optimum of more unlike agents than a chain takes."""
+    """Sample the optimum of agents that a chain would have too many states of."""
     found = sampled.averaged(system, items, replace(how, estimator=OPTIMAL), errors)
-    said = f"more than {MOST_UNLIKE} unlike agents or links: sampled, {how.runs:,} runs; ± standard error"
+    said = f"the contact chain has more than {MOST_STATES} states: sampled, {how.runs:,} runs; ± standard error"
     return found._replace(notes=(*found.notes, said))
 
 
