@@ -90,14 +90,12 @@ class Contacts:
     starts : state before the exchange at the last step, for each group of agents.
     transition : T(s → s′) at a step, shape (rows, states, states), for some of the rows.
     constant : whether it is the same at every step.
-    falling : whether no count of a path is larger than one of an earlier step.
     """
 
     held: np.ndarray
     starts: tuple[int, ...]
     transition: Callable[[int, slice | np.ndarray], np.ndarray]
     constant: bool
-    falling: bool = True
 
 
 def contacts(
@@ -149,7 +147,7 @@ def _measured(all_held: Contacts, detects: np.ndarray, network: Network) -> Cont
 
     # what is measured at the last step is no part of what an agent holds before its exchange
     starts = tuple(int(np.flatnonzero(of == start)[0]) for start in all_held.starts)
-    return Contacts(counts, starts, transition, constant=False, falling=False)
+    return Contacts(counts, starts, transition, constant=False)
 
 
 def by_age(delay: Sequence[float], µ: np.ndarray, burst: np.ndarray | None, oldest: int) -> np.ndarray:
@@ -501,10 +499,10 @@ def leading(
 ) -> Iterator[tuple[Any, np.ndarray, np.ndarray]]:
     """Classes of paths that may lead to the states here: the class, which of its paths do, and their weight here."""
     rows_here = T[:, here]
+    from_here = np.asarray(rows_here.any(axis=(0, 1)))
     for before, paths in classes.items():
-        block = rows_here[:, :, states[before]]
-        if block.any():
-            weight = block @ paths.weight
+        if from_here[states[before]].any():
+            weight = rows_here[:, :, states[before]] @ paths.weight
             alive = np.flatnonzero(weight.any(axis=(0, 1)))
             if len(alive):
                 yield paths, alive, weight[:, :, alive]
@@ -608,8 +606,7 @@ def _grown(
 def check_size(paths: float, numbers: float = 0.0) -> None:
     """Raise TooManyPathsError beyond `MOST_PATHS` paths or `MOST_NUMBERS` weights."""
     if paths > MOST_PATHS or numbers > MOST_NUMBERS:
-        number = f"{paths:.3g} paths or more" if paths < np.inf else "too many paths, which unlike agents do not order"
         raise TooManyPathsError(
-            f"the contact chain has {number}, at most {MOST_PATHS} are gone through one by one: use "
+            f"the contact chain has {paths:.3g} paths or more, at most {MOST_PATHS} are gone through one by one: use "
             "fewer steps or agents, or --method monte-carlo with --estimator optimal"
         )
