@@ -188,7 +188,7 @@ class _Classes:
     @cached_property
     def possible(self) -> np.ndarray:
         """Whether a receiver of one class may ever hear a sender of another, (classes, classes)."""
-        there, link = reachable(self.network)[self.pairs], self.rows.link
+        there, link = np.asarray(reachable(self.network)[self.pairs]), self.rows.link
         if self.rows.uniform or self.rows.bursts is not None:
             return there
         return there & (link > 0).reshape(-1, *link.shape[-2:]).any(axis=0)[self.pairs]
@@ -376,6 +376,7 @@ class LosslessFilter(NamedTuple):
     shared : whether all agents start from one common estimate.
     error : (d, 1) initial error that all agents share, or None.
     numbers : what the numbers go through.
+    first : covariance to start from by the counts held, in the place of that of first estimates.
     """
 
     model: Model
@@ -384,11 +385,17 @@ class LosslessFilter(NamedTuple):
     shared: bool
     error: np.ndarray | None = None
     numbers: Numbers = AsTheyAre()
+    first: Mapping[tuple[int, ...], np.ndarray] | None = None
+
+    def begins(self, counts: np.ndarray) -> list[int]:
+        """Places of the counts that a path may start with: at step 1 everybody has a first estimate."""
+        return np.flatnonzero(counts.any(axis=1) | (self.first is not None)).tolist()
 
     def start(self, counts: np.ndarray) -> AlongPath:
         """Estimate from so many agents' initial ones, and what it leaves of the error."""
         x = np.zeros((self.model.dimension, 1)) if self.error is None else self.error
-        P = (self.P0 if self.shared else self.P0 / counts.sum())[None]
+        first = self.P0 if self.shared or self.first is not None else self.P0 / counts.sum()
+        P = (first if self.first is None else self.first[tuple(counts.tolist())])[None]
         return AlongPath(np.broadcast_to(x, (*P.shape[:-1], 1)), P if self.scalar else self.numbers.factor(P))
 
     def after(self, before: AlongPath, counts: np.ndarray, step: int) -> AlongPath:
@@ -549,8 +556,7 @@ def over_paths(
     paths, before = 0, np.empty(0)
     for step, T in enumerate(transitions(contacts, steps, some), start=1):
         if step == 1:
-            # at step 1 everybody has a first estimate
-            ones = {c: np.ones((len(T), len(states[c]), 1)) for c in range(len(counts)) if counts[c].any()}
+            ones = {c: np.ones((len(T), len(states[c]), 1)) for c in given.begins(counts)}
             classes = {c: Class(given.start(counts[c]), weight) for c, weight in ones.items()}
         else:
             classes = _grown(given, classes, before, counts, states, step)

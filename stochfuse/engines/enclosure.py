@@ -6,9 +6,9 @@ therefore only raise the expectation, and splitting it between the cell's ends, 
 side by side, the two enclose it, and the gap falls with the square of the cell's width.
 
 Matrix models carry a pair of covariances for every path, at first equal.  Where paths are too many, the likeliest half
-is kept; of the others those that agree in their last L counts are taken together, L as large as their number allows, and
-what they carry is put between bounds in the positive-definite order: with A = L_A L_Aᵀ, B = L_B L_Bᵀ and the singular
-values L_A⁻¹L_B = U diag(s) Vᵀ, of all that is at least (at most) A and B
+is kept; of the others those that agree in their last L counts are taken together, L as large as their number allows,
+and what they carry is put between bounds in the positive-definite order: with A = L_A L_Aᵀ, B = L_B L_Bᵀ and the
+singular values L_A⁻¹L_B = U diag(s) Vᵀ, of all that is at least (at most) A and B
 
     L_A U diag(max(s, 1))² Uᵀ L_Aᵀ       (L_A U diag(min(s, 1))² Uᵀ L_Aᵀ)
 
@@ -92,11 +92,10 @@ def _on_a_grid(given: LosslessFilter, contacts: Contacts, steps: int, some: slic
             out[..., here, :] = given.after(AlongPath(None, P[..., here, :, :, :]), count, step).root[..., 0, 0]
         return out
 
-    # at step 1 everybody has a first estimate: what a state without one would start from does not matter
+    # what a state without a first estimate would start from does not matter
     start = np.full(len(contacts.held), given.covariance(given.start(counts[-1])).item())
-    for count, here in zip(counts, states, strict=True):
-        if count.any():
-            start[here] = given.covariance(given.start(count)).item()
+    for c in given.begins(counts):
+        start[states[c]] = given.covariance(given.start(counts[c])).item()
     nodes = _nodes(start, after, steps)
     shape = (len(range(*some.indices(some.stop))), len(start), len(nodes))
     low = _split(nodes, np.broadcast_to(start[:, None], (*shape[:2], 1)), np.ones((*shape[:2], 1)))
@@ -170,7 +169,7 @@ def _by_last_counts(
     lower, upper, before = [], [], np.empty(0)
     for step, T in enumerate(transitions(contacts, steps, some), start=1):
         if step == 1:
-            for c in np.flatnonzero(counts.any(axis=1)).tolist():
+            for c in given.begins(counts):
                 L = given.start(counts[c]).root
                 classes[c] = _Merged(np.full((1, LAST), c), L, L, np.ones((len(T), len(states[c]), 1)))
         else:

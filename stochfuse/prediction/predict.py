@@ -116,7 +116,7 @@ def predict(
         "consistency", actual / claimed, more than 1 where the rule is overconfident;
         "bias", what is left of the scenario's known initial error (initial.error);
         "rms", the root of the mean squared error, noise and bias.
-    steady : also solve for the steady state (simplified).
+    steady : also find what it tends to, see `stochfuse.prediction.limits`: a steady state, or a cycle.
     interval : a probability (0.95, "95%"): also what the log behind the scenario's links leaves unknown, see
         `Prediction.interval`.
     over : values of one or two numbers of the scenario by their paths, {"network.delay": [0, 1, 2]}: what is
@@ -154,12 +154,8 @@ def predict(
         and settings.get("estimator") is not None
         and quantity != registry.OPTIMAL
     ):
-        return _by_any(scenario, link, quantity, {**settings, "interval": interval})
+        return _by_any(scenario, link, quantity, {**settings, "interval": interval, "steady": steady})
     method, how = _asked(scenario, method, quantity, settings)
-    if steady and method != SIMPLIFIED:
-        raise UsageError(f"steady: expected method simplified, got {method}")
-    if steady and quantity != "claimed":
-        raise UsageError(f"steady: expected quantity claimed, got {quantity}")
     rows = link_rows(scenario, link)
     found = _averaged(scenario.system, Items(rows), method, how, quantity)
     if found.faults:
@@ -170,8 +166,7 @@ def predict(
         prediction = replace(prediction, supported=_supported(scenario, link, interval, method, quantity, settings))
     if not steady:
         return prediction
-    fixed = _room("steady_state").steady_state(scenario, rows)
-    return prediction.with_steady(fixed.P, fixed.bound)
+    return replace(prediction, limit=_room("limits").limit(prediction, rows, how))
 
 
 def _supported(

@@ -289,6 +289,31 @@ def require(system: System, links: LinkRows, estimator: str, engine: str) -> Non
                 raise UsageError(f"{rule.who.format(estimator=estimator)}: {rule.why}{instead}")
 
 
+def takes(system: System, links: LinkRows, estimator: str, engine: str) -> bool:
+    """Whether an estimator averaged by an engine takes what a system has."""
+    try:
+        require(system, links, estimator, engine)
+    except UsageError:
+        return False
+    return True
+
+
+def require_endless(system: System, links: LinkRows, *, periodic: bool) -> None:
+    """Raise UsageError if what is given ends with its steps, so that there is no steady state to ask for.
+
+    Parameters
+    ----------
+    periodic : whether what varies does so with a period, as far as that can be told.
+    """
+    for feature in FEATURES:
+        if feature.name in ("links-per-step", *(() if periodic else ("matrices-per-step",))):
+            if feature.has(system, links):
+                raise UsageError(
+                    "a steady state needs a model, sensors and links that do not vary with the step, or sensors with a "
+                    f"period; got {feature.key}"
+                )
+
+
 LATE, GAPS, BY_NAME = "messages that came late", "measurements that are missing", "sensors by name"
 """What a record may have that its scenario need not have, or that counts only on data."""
 _AS_FEATURE = {LATE: "delay", GAPS: "detection"}
