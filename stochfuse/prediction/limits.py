@@ -11,7 +11,7 @@ fixed point is then enclosed by two runs of (54), from P = 0 and from one so lar
 
 Burn-in.  Two samples hear the same arrivals.  One starts from P(k0)/100, common to all agents, with the known initial
 error, the other from 100 P(k0), independent, without it.  The step is doubled until every variance of the two, at two
-cycles of steps, differs by less than a tenth of its standard error, and is what it was at half the steps within three
+cycles of steps, differs by less than a tenth of its standard error, and is the same at twice the steps within three
 of them: what is claimed may settle while the true error grows.  Then the runs are independent, and the standard error
 of the sample at that step is that of the steady state.
 """
@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -49,8 +50,10 @@ from stochfuse.scenario.system import System
 
 LONGEST_PERIOD = 60
 """Steps that a cycle may have."""
-TIGHT, MOST_STEPS = 1e-10, 512
-"""Relative width at which bounds are close enough, and steps after which they will not be."""
+TIGHT, STALLED = 1e-10, 0.9
+"""Relative width at which bounds are close enough, and share of it that is left where they come no closer."""
+MOST_STEPS, MOST_ALONG_PATHS = 512, 1024
+"""Steps after which a limit is not reached, and those where the paths are few."""
 NEVER_AGAIN = 1e-14
 """Change of the probability that a bursty link delivers, after one more failure, that is none."""
 PILOT = 100
@@ -79,8 +82,8 @@ def limit(prediction: Prediction, rows: LinkRows, how: Settings) -> Limit:
         found = _by_chain(prediction, alone, period)
         if found is not None:
             return found
-    elif scenario.system.one_state and period == 1 and capabilities.takes(scenario.system, rows, OPTIMAL, CHAIN):
-        _require_bounded(scenario, rows)  # nothing is better than the optimum
+    if period == 1 and capabilities.takes(scenario.system, rows, OPTIMAL, CHAIN):
+        _require_bounded(scenario, rows, sampled=True)  # nothing is better than the optimum
     return _by_sampling(prediction, rows, period, how)
 
 
@@ -165,11 +168,11 @@ def _fixed_cycle(prediction: Prediction, rows: LinkRows, period: int) -> Limit:
     raise NoAnswerError(f"no cycle: the averaged covariance does not settle within {MOST_STEPS} steps")
 
 
-def _doubling(period: int, least: int = 16) -> Iterator[int]:
+def _doubling(period: int, least: int = 16, most: int = MOST_STEPS) -> Iterator[int]:
     """Numbers of steps to try, whole periods each."""
     steps = period * -(-max(least, 2 * period + 2) // period)
-    while steps <= max(MOST_STEPS, 8 * period):
-        listener().advance("steady state", steps, MOST_STEPS)
+    while steps <= max(most, 8 * period):
+        listener().advance("steady state", steps, most)
         yield steps
         steps *= 2
 
@@ -187,8 +190,8 @@ def _chain_of(system: System, rows: LinkRows, groups: tuple[tuple[int, ...], ...
     return contacts(replace(system.network, steps=remembered), rows, system.sensor_of, groups, detects)
 
 
-def _require_bounded(scenario: Scenario, rows: LinkRows) -> None:
-    """Raise NoAnswerError where even the optimum grows without end, as far as that can be told."""
+def _require_bounded(scenario: Scenario, rows: LinkRows, *, sampled: bool) -> None:
+    """Raise NoAnswerError where even the optimum grows without end, as far as that can be told; or has no variance."""
     if np.abs(np.linalg.eigvals(scenario.system.model.F[-1])).max() < 1.0:
         return
     system = prolonged(scenario, 4).system
@@ -197,14 +200,22 @@ def _require_bounded(scenario: Scenario, rows: LinkRows) -> None:
         chain = _chain_of(system, rows, groups, 1)
     except TooManyStatesError:
         return
-    for row in range(len(rows.link)):
-        found = growing(optimal.filter_of(system), chain, row)
-        if found is not None:
+    for row, moment in product(range(len(rows.link)), (1, 2) if sampled else (1,)):
+        found = growing(optimal.filter_of(system), chain, row, moment)
+        if found is None:
+            continue
+        where = f"(link probability {rows.means(scenario.network)[row]:g})"
+        if moment == 1:
             raise NoAnswerError(
                 f"no steady state: the mode of F with eigenvalue {found[0]:.6g} grows by a factor of at least "
                 f"{found[1]:.6g} in every step, on average over what arrives, for the optimum too: too often nothing "
-                f"that arrives shows it (link probability {rows.means(scenario.network)[row]:g})"
+                f"that arrives shows it {where}"
             )
+        raise NoAnswerError(
+            f"the steady state cannot be sampled: the covariance, even the optimum's, has no variance over the "
+            f"outcomes, since the square of what the mode of F with eigenvalue {found[0]:.6g} adds grows by a factor of "
+            f"at least {found[1]:.6g} {where}"
+        )
 
 
 def _by_chain(prediction: Prediction, rows: LinkRows, period: int) -> Limit | None:
@@ -219,7 +230,8 @@ def _by_chain(prediction: Prediction, rows: LinkRows, period: int) -> Limit | No
         for some in [slice(0, n)] if everywhere else [slice(row, row + 1) for row in range(n)]:
             begin = everywhere or starts(given, chain, period, some.start)
             if begin is None:
-                _require_bounded(scenario, rows.take(some)) if period == 1 else None
+                if period == 1:
+                    _require_bounded(scenario, rows.take(some), sampled=False)
                 raise NoAnswerError(
                     "no steady state of the optimum is known: bounds on it do not settle, links or filters are too "
                     f"slow (link probability {rows.means(scenario.network)[some.start]:g})"
@@ -242,26 +254,31 @@ def _between(
     scenario: Scenario, chain: Contacts, begin: Starts, some: slice, period: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper bounds of some rows at the phases, by ever longer paths."""
-    every, before = True, np.inf
-    low = high = np.empty(0)
-    for steps in _doubling(period, 8):
+    every, before, found = True, np.inf, None
+    for steps in _doubling(period, 8, MOST_ALONG_PATHS):
         given = optimal.filter_of(prolonged(scenario, steps + 1).system)
         sides = [given._replace(first=first) for first in begin]
         while True:
             try:
-                low, high = (_side(side, chain, steps + 1, some, every)[which] for which, side in enumerate(sides))
+                with np.errstate(over="ignore", invalid="ignore"):
+                    ends = [_side(side, chain, steps + 1, some, every)[which] for which, side in enumerate(sides)]
                 break
             except TooManyPathsError:
                 if not every:
                     raise
                 every = False
         # step 1 is one of those ≡ 1: the last period ends at ≡ 1
-        low, high = (np.roll(side[:, -period:], 1, axis=1) for side in (low, high))
+        low, high = (np.roll(side[:, -period:], 1, axis=1) for side in ends)
+        if not np.isfinite(high).all():  # what is hardly ever left unabsorbed grows beyond floating point
+            break
+        found = low, high
         width = float(half_width(high - low, 0.5 * (low + high)).max())
-        if width <= TIGHT or not width < 0.7 * before:
+        if width <= TIGHT or not (every or (steps < MOST_STEPS and width < STALLED * before)):
             break
         before = width
-    return low, high
+    if found is None:
+        raise TooManyPathsError("bounds on the steady optimum grow beyond floating point")
+    return found
 
 
 def _side(
@@ -276,22 +293,22 @@ def _side(
 
 def _by_sampling(prediction: Prediction, rows: LinkRows, period: int, how: Settings) -> Limit:
     """Sample at a step by which two starts that are far apart no longer differ."""
-    scenario, wanted = prediction.scenario, _Wanted(prediction, rows, how, period)
+    scenario, wanted = prediction.scenario, _Wanted(prediction, rows, period)
     few = replace(how, runs=min(how.runs, PILOT))
-    share, before = np.sqrt(few.runs / how.runs), None
+    share, settled = np.sqrt(few.runs / how.runs), None
     for steps in _doubling(period):
-        near, far = (wanted.at(start, few) for start in _two(prolonged(scenario, steps)))
-        gaps = wanted.apart(near, far, share)
-        moved = np.inf if before is None else wanted.apart(near, before, 1.0)
-        before = near
-        if np.max(gaps) <= 0.1 and np.max(moved) <= 3.0:
-            found = wanted.at(prolonged(scenario, steps), how)
+        one, other = _two(prolonged(scenario, steps))
+        near = wanted.at(one, few)
+        if settled is not None and wanted.apart(near, settled[1], 1.0) <= 3.0:
+            at, _, gap = settled
             note = (
-                f"steady state: sampled at step {steps}, {how.runs:,} runs; two samples of the same arrivals, from "
-                f"P(k0)/{FAR:g} and from {FAR:g} P(k0), differ there by at most {np.max(gaps):.1g} standard errors"
+                f"steady state: sampled at step {at}, {how.runs:,} runs; two samples of the same arrivals, from "
+                f"P(k0)/{FAR:g} and from {FAR:g} P(k0), differ there by at most {gap:.1g} standard errors"
             )
             cycle = f"the limit is a cycle of {period} steps, of which the mean is shown"
-            return Limit(found, period, None, (note, *[cycle] * (period > 1)))
+            return Limit(wanted.at(prolonged(scenario, at), how), period, None, (note, *[cycle] * (period > 1)))
+        gap = wanted.apart(near, wanted.at(other, few), share)
+        settled = (steps, near, gap) if gap <= 0.1 else None
     raise NoAnswerError(
         f"no steady state: within {MOST_STEPS} steps two samples of the same arrivals that start far apart do not agree, "
         "or the error grows; it mixes too slowly, or there is none"
@@ -312,7 +329,7 @@ def _two(scenario: Scenario) -> tuple[Scenario, Scenario]:
 class _Wanted:
     """What is sampled of a prediction's quantity, and compared."""
 
-    def __init__(self, prediction: Prediction, rows: LinkRows, how: Settings, period: int) -> None:
+    def __init__(self, prediction: Prediction, rows: LinkRows, period: int) -> None:
         self.prediction, self.rows, self.period = prediction, rows, period
         self.metrics = [f"var:{state}" for state in prediction.scenario.model.states]
 
@@ -326,8 +343,8 @@ class _Wanted:
         shown = self.prediction.quantity
         return found.shown_as("claimed" if shown == OPTIMAL else shown)
 
-    def apart(self, one: Prediction, other: Prediction, share: float) -> np.ndarray:
-        """How far two samples are apart at the last two cycles, in standard errors times a share of them."""
+    def apart(self, one: Prediction, other: Prediction, share: float) -> float:
+        """How far two samples are apart at the last two cycles, at most, in standard errors times a share of them."""
         found, last = [], -2 * self.period
         for quantity in ("claimed", "rms") if self.prediction.with_actual else ("claimed",):
             a, b = one.shown_as(quantity), other.shown_as(quantity)
@@ -337,4 +354,4 @@ class _Wanted:
                 # where nothing is left to chance, digits are asked for
                 unit = np.maximum(share * error[:, last:], 1e-7 * np.abs(x[:, last:]) + 1e-300)
                 found.append((np.abs(x[:, last:] - y[:, last:]) / unit).max())
-        return np.array(found)
+        return float(np.max(found))

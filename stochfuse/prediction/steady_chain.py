@@ -12,7 +12,8 @@ leave anything of it (`stochfuse.engines.contact_chain` and `enclosure` go throu
 TU and update are monotone and concave, so that by Jensen's inequality E[P_t | s] ≤ G(E[P_t−1 | ·])(s): what starts
 below V stays there.  V̂ is G's fixed point; where the filters of all sets settle by themselves, the same with T = 1 is
 one bound for all rows of link probabilities.  If nothing settles: in a set that goes on with probability p and does not
-show a mode λ of F, E[P] grows by p|λ|² in every step, and p|λ|² ≥ 1 is a proof that there is no steady state.
+show a mode λ of F, E[P] grows by p|λ|² in every step, and p|λ|² ≥ 1 is a proof that there is no steady state.  Where
+p|λ|⁴ ≥ 1 there may be one, but P has no variance over the outcomes: no sample's standard error means anything.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from stochfuse.prediction.boundedness import hidden_mode
 
 LARGE = 1e4
 """Variances that bounds settle from, in those of first estimates and process noise."""
-SETTLED, MOST_PERIODS = 1e-6, 1500
+SETTLED, MOST_PERIODS = 1e-6, 10_000
 SHARE = 1e-12
 """What rounding may add to the lower start, relative."""
 
@@ -105,10 +106,14 @@ def _settled(on: Callable[[np.ndarray], np.ndarray], V: np.ndarray) -> np.ndarra
     return None
 
 
-def growing(given: LosslessFilter, contacts: Contacts, row: int) -> tuple[complex, float] | None:
+def growing(given: LosslessFilter, contacts: Contacts, row: int, moment: int = 1) -> tuple[complex, float] | None:
     """Return a mode of F that no steady state keeps bounded, and by how much it grows in a step; or None.
 
     The model and what is measured must not vary with the step.
+
+    Parameters
+    ----------
+    moment : 1 for E[P], 2 for E[P²].
     """
     T = contacts.transition(2, slice(row, row + 1))[0]
     F, sd = at_step(given.model.F, 2), np.sqrt(np.diagonal(given.P0) + np.diagonal(at_step(given.model.Q, 2)))
@@ -123,6 +128,7 @@ def growing(given: LosslessFilter, contacts: Contacts, row: int) -> tuple[comple
         seen = [at_step(sensor.H, 2) for sensor, n in zip(given.sensors, contacts.held[s], strict=True) if n]
         H = np.concatenate([*seen, np.zeros((1, len(F)))])
         mode = hidden_mode(F * sd / sd[:, None], H * sd)
-        if mode is not None and T[s, s] * abs(mode) ** 2 >= 1.0:
-            return mode, float(T[s, s] * abs(mode) ** 2)
+        factor = 0.0 if mode is None else float(T[s, s] * abs(mode) ** (2 * moment))
+        if mode is not None and factor >= 1.0:
+            return mode, factor
     return None
