@@ -46,6 +46,8 @@ GRID = 800
 """Grid cells over the range of P."""
 MOST_MERGED, LAST = 10_000, 24
 """Paths that are carried, and their last counts that are remembered."""
+NEGLIGIBLE = 1e-16
+"""Weight of a path that is not worth to be followed by itself."""
 WORTHLESS = 1e-6
 """Rounding beyond which a bound is none."""
 ROUNDING = 1e-13
@@ -67,9 +69,19 @@ def enclosed_optimum(given: LosslessFilter, contacts: Contacts, steps: int, rows
     return Chain(middle, None, None, half_width(high - low, middle) + ROUNDING, None)
 
 
-def enclosed(given: LosslessFilter, contacts: Contacts, steps: int, some: slice) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper expectations of some rows, (rows, steps, groups, d, d)."""
-    return (_on_a_grid if given.model.dimension == 1 else _by_last_counts)(given, contacts, steps, some)
+def enclosed(
+    given: LosslessFilter, contacts: Contacts, steps: int, some: slice, above: LosslessFilter | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper expectations of some rows, (rows, steps, groups, d, d).
+
+    Parameters
+    ----------
+    above : what the upper one starts from, if that is something else.
+    """
+    if given.model.dimension > 1:
+        return _by_last_counts(given, contacts, steps, some, above or given)
+    low, high = _on_a_grid(given, contacts, steps, some)
+    return low, high if above is None else _on_a_grid(above, contacts, steps, some)[1]
 
 
 def half_width(gap: np.ndarray, middle: np.ndarray) -> np.ndarray:
@@ -159,7 +171,7 @@ def _added(nodes: np.ndarray, place: np.ndarray, mass: np.ndarray) -> np.ndarray
 
 
 def _by_last_counts(
-    given: LosslessFilter, contacts: Contacts, steps: int, some: slice
+    given: LosslessFilter, contacts: Contacts, steps: int, some: slice, above: LosslessFilter
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper expectations, (rows, steps, groups, d, d), by paths merged to their last counts."""
     counts, states = by_counts(contacts)
@@ -170,8 +182,8 @@ def _by_last_counts(
     for step, T in enumerate(transitions(contacts, steps, some), start=1):
         if step == 1:
             for c in given.begins(counts):
-                L = given.start(counts[c]).root
-                classes[c] = _Merged(np.full((1, LAST), c), L, L, np.ones((len(T), len(states[c]), 1)))
+                low, high = given.start(counts[c]).root, above.start(counts[c]).root
+                classes[c] = _Merged(np.full((1, LAST), c), low, high, np.ones((len(T), len(states[c]), 1)))
         else:
             classes = _grown(given, classes, before, counts, states, step)
         last = {c: closing(T, contacts.starts, states[c], merged.weight) for c, merged in classes.items()}
@@ -273,12 +285,14 @@ def _grown(
 
 
 def _fewer(classes: dict[int, _Merged]) -> dict[int, _Merged]:
-    """At most `MOST_MERGED` paths, if there are no more counts than that."""
+    """At most `MOST_MERGED` paths, if there are no more counts than that; all together that hardly ever come about."""
     likely = {c: m.weight.max(axis=(0, 1)) for c, m in classes.items()}
-    likelihoods, half = np.concatenate(list(likely.values())), MOST_MERGED // 2
-    if len(likelihoods) <= MOST_MERGED:
-        return classes
-    others = {c: w <= np.partition(likelihoods, -half)[-half] for c, w in likely.items()}
+    likelihoods, half, least = np.concatenate(list(likely.values())), MOST_MERGED // 2, NEGLIGIBLE
+    if np.count_nonzero(likelihoods > least) > MOST_MERGED:
+        least = np.partition(likelihoods, -half)[-half]
+    others = {c: w <= least for c, w in likely.items()}
+    if least == NEGLIGIBLE:
+        return {c: m.alone(others[c], 1) for c, m in classes.items()}
     last = np.concatenate([m.last[others[c]] for c, m in classes.items()])
     last = last[np.lexsort(last.T)][:, ::-1]
     # how many different ones there are by the last 1, 2 … counts: those that differ from the one before by then

@@ -254,19 +254,16 @@ def _between(
     scenario: Scenario, chain: Contacts, begin: Starts, some: slice, period: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper bounds of some rows at the phases, by ever longer paths."""
-    every, before, found = True, np.inf, None
+    every, before, found, ends = True, np.inf, None, []
     for steps in _doubling(period, 8, MOST_ALONG_PATHS):
         given = optimal.filter_of(prolonged(scenario, steps + 1).system)
         sides = [given._replace(first=first) for first in begin]
-        while True:
+        with np.errstate(over="ignore", invalid="ignore"):
             try:
-                with np.errstate(over="ignore", invalid="ignore"):
-                    ends = [_side(side, chain, steps + 1, some, every)[which] for which, side in enumerate(sides)]
-                break
+                ends = [over_paths(side, chain, steps + 1, some)[0][0] for side in sides] if every else []
             except TooManyPathsError:
-                if not every:
-                    raise
                 every = False
+            ends = ends if every else enclosed(sides[0], chain, steps + 1, some, sides[1])
         # step 1 is one of those ≡ 1: the last period ends at ≡ 1
         low, high = (np.roll(side[:, -period:], 1, axis=1) for side in ends)
         if not np.isfinite(high).all():  # what is hardly ever left unabsorbed grows beyond floating point
@@ -279,16 +276,6 @@ def _between(
     if found is None:
         raise TooManyPathsError("bounds on the steady optimum grow beyond floating point")
     return found
-
-
-def _side(
-    given: LosslessFilter, chain: Contacts, steps: int, some: slice, every: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper expectations along every path, where they are the same, or along some."""
-    if not every:
-        return enclosed(given, chain, steps, some)
-    P = over_paths(given, chain, steps, some)[0][0]
-    return P, P
 
 
 def _by_sampling(prediction: Prediction, rows: LinkRows, period: int, how: Settings) -> Limit:

@@ -29,7 +29,7 @@ from stochfuse.prediction.boundedness import hidden_mode
 
 LARGE = 1e4
 """Variances that bounds settle from, in those of first estimates and process noise."""
-SETTLED, MOST_PERIODS = 1e-6, 10_000
+SETTLED, MOST_PERIODS, FEW_PERIODS = 1e-6, 10_000, 300
 SHARE = 1e-12
 """What rounding may add to the lower start, relative."""
 
@@ -61,7 +61,8 @@ def starts(given: LosslessFilter, contacts: Contacts, period: int, row: int | No
         return V
 
     sd = np.sqrt(np.diagonal(given.P0) + np.diagonal(given.model.Q, axis1=-2, axis2=-1).max(axis=0))
-    V = _settled(on, np.tile(LARGE * np.diag(np.where(sd > 0, sd, 1.0) ** 2), (len(contacts.held), 1, 1)))
+    large = np.tile(LARGE * np.diag(np.where(sd > 0, sd, 1.0) ** 2), (len(contacts.held), 1, 1))
+    V = _settled(on, large, MOST_PERIODS if T else FEW_PERIODS)
     if V is None:
         return None
     d, high = V.shape[-1], {}
@@ -83,10 +84,10 @@ def _after(given: LosslessFilter, P: np.ndarray, counts: np.ndarray, step: int) 
     return given.covariance(given.after(AlongPath(None, root), counts, step))
 
 
-def _settled(on: Callable[[np.ndarray], np.ndarray], V: np.ndarray) -> np.ndarray | None:
+def _settled(on: Callable[[np.ndarray], np.ndarray], V: np.ndarray, most: int) -> np.ndarray | None:
     """V with G(V) ≤ V a little above G's fixed point, from what is large; None if that does not settle."""
     largest, unit = V.max(), np.ones_like(V)
-    for _ in range(MOST_PERIODS):
+    for _ in range(most):
         before, V = V, on(V)
         if not np.isfinite(V).all() or V.max() > 1e12 * largest:
             return None
