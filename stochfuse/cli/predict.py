@@ -31,7 +31,7 @@ from stochfuse.cli.options import (
     whose,
 )
 from stochfuse.errors import UsageError
-from stochfuse.scenario.registry import GENERAL, NAIVE, SIMPLIFIED, STATE
+from stochfuse.scenario.registry import GENERAL, MONTE_CARLO, NAIVE, SIMPLIFIED, STATE
 
 if TYPE_CHECKING:
     from stochfuse.report.predictions import PredictionView
@@ -65,7 +65,7 @@ def predict(
     at: AtOption = None,
     normalise: Annotated[bool, option("Relative to link probability 0.", SHOWN + RARE, "--normalise")] = False,
     steady: Annotated[
-        bool, option("Add the steady state, P = g(P), with a proved bound (simplified).", SHOWN, "--steady")
+        bool, option("Add the steady state or cycle: proved bounds, or sampled after a burn-in.", SHOWN, "--steady")
     ] = False,
     interval: Annotated[
         str | None, option("Also the interval that the log behind the links supports: 95%.", SHOWN, metavar="P%")
@@ -126,7 +126,8 @@ def predict(
             if given_too:
                 raise UsageError(f"{flag}: expected without --interval")
     asked_for = {"steady": steady, "over": swept} | ({} if interval is None else {"interval": interval})
-    settings = {**asked_for, **settings_for([way], **given_settings)}
+    # a steady state may have to be sampled
+    settings = {**asked_for, **settings_for([way, *[MONTE_CARLO] * steady], **given_settings)}
     if swept and statistic != "mean":
         settings["one_by_one"] = True  # whose outcomes are kept
     if normalise and swept and any(key.name == PLACES["link"] for key in swept.keys):
@@ -197,13 +198,6 @@ def _warn(views: tuple[PredictionView, ...]) -> None:
         if text:
             typer.echo(f"warning: {text}", err=True)
             break
-    if first.prediction.steady_bound is not None:
-        _tell_bound(first.prediction.steady_bound.max())
-
-
-def _tell_bound(worst: float) -> None:
-    if worst < 1:
-        text = f"the steady state is proved to lie within a relative {worst:.0e} of the value shown"
-    else:
-        text = "the steady state's residual is at rounding level, but no bound on it could be proved"
-    typer.echo(f"note: {text}", err=True)
+    limits = [part.limit for view in views for part in view.parts if part.limit is not None]
+    for note in dict.fromkeys(note for limit in limits for note in limit.notes):
+        typer.echo(f"note: {note}", err=True)

@@ -11,8 +11,8 @@ fixed point is then enclosed by two runs of (54), from P = 0 and from one so lar
 
 Burn-in.  Two samples hear the same arrivals.  One starts from P(k0)/100, common to all agents, with the known initial
 error, the other from 100 P(k0), independent, without it.  The step is doubled until every variance of the two, at two
-cycles of steps, differs by less than a tenth of its standard error, and is the same at twice the steps within three
-of them: what is claimed may settle while the true error grows.  Then the runs are independent, and the standard error
+cycles of steps, differs by less than a tenth of its standard error, and is the same at twice the steps within six of
+them: what is claimed may settle while the true error grows.  Then the runs are independent, and the standard error
 of the sample at that step is that of the steady state.
 """
 
@@ -27,7 +27,6 @@ import numpy as np
 
 from stochfuse.engines.contact_chain import (
     Contacts,
-    LosslessFilter,
     TooManyPathsError,
     TooManyStatesError,
     contacts,
@@ -50,14 +49,16 @@ from stochfuse.scenario.system import System
 
 LONGEST_PERIOD = 60
 """Steps that a cycle may have."""
-TIGHT, STALLED = 1e-10, 0.9
-"""Relative width at which bounds are close enough, and share of it that is left where they come no closer."""
+TIGHT, TIGHT_BETWEEN, STALLED = 1e-10, 1e-7, 0.5
+"""Relative width at which bounds are close enough, along every path and not; and what is left where they stay apart."""
 MOST_STEPS, MOST_ALONG_PATHS = 512, 1024
 """Steps after which a limit is not reached, and those where the paths are few."""
 NEVER_AGAIN = 1e-14
 """Change of the probability that a bursty link delivers, after one more failure, that is none."""
 PILOT = 100
 """Runs by which a burn-in is found."""
+CLOSE, MOVED = 0.1, 6.0
+"""Standard errors by which two starts may differ, and one start at twice the steps: the largest of many."""
 FAR = 100.0
 """Factor on P(k0) by which two starts differ from it."""
 
@@ -184,9 +185,9 @@ def _chain_of(system: System, rows: LinkRows, groups: tuple[tuple[int, ...], ...
         if burst is not None:
             p = delivery_after_failures(burst[None], np.ones(MOST_STEPS))[0]
             remembered = max(remembered, 2 + int((np.abs(p - p[-1]) > NEVER_AGAIN).sum()))
-    detects = None if system.detects is None else system.detects.copy()
-    if detects is not None:
-        detects[0] = detects[period]  # the first step is one of many
+    detects = system.detects
+    if detects is not None:  # the first step is one of many
+        detects = np.tile(np.roll(detects[1 : period + 1], 1, axis=0), (2 * MOST_ALONG_PATHS // period + 2, 1))
     return contacts(replace(system.network, steps=remembered), rows, system.sensor_of, groups, detects)
 
 
@@ -212,9 +213,9 @@ def _require_bounded(scenario: Scenario, rows: LinkRows, *, sampled: bool) -> No
                 f"that arrives shows it {where}"
             )
         raise NoAnswerError(
-            f"the steady state cannot be sampled: the covariance, even the optimum's, has no variance over the "
-            f"outcomes, since the square of what the mode of F with eigenvalue {found[0]:.6g} adds grows by a factor of "
-            f"at least {found[1]:.6g} {where}"
+            "the steady state cannot be sampled: the covariance, even the optimum's, has no variance over the outcomes, "
+            f"since the square of what the mode of F with eigenvalue {found[0]:.6g} adds grows by a factor of at least "
+            f"{found[1]:.6g} in every step {where}"
         )
 
 
@@ -228,10 +229,10 @@ def _by_chain(prediction: Prediction, rows: LinkRows, period: int) -> Limit | No
         everywhere = starts(given, chain, period, None)
         parts, n = [], len(rows.link)
         for some in [slice(0, n)] if everywhere else [slice(row, row + 1) for row in range(n)]:
+            if everywhere is None and period == 1:
+                _require_bounded(scenario, rows.take(some), sampled=False)
             begin = everywhere or starts(given, chain, period, some.start)
             if begin is None:
-                if period == 1:
-                    _require_bounded(scenario, rows.take(some), sampled=False)
                 raise NoAnswerError(
                     "no steady state of the optimum is known: bounds on it do not settle, links or filters are too "
                     f"slow (link probability {rows.means(scenario.network)[some.start]:g})"
@@ -270,7 +271,7 @@ def _between(
             break
         found = low, high
         width = float(half_width(high - low, 0.5 * (low + high)).max())
-        if width <= TIGHT or not (every or (steps < MOST_STEPS and width < STALLED * before)):
+        if width <= (TIGHT if every else TIGHT_BETWEEN) or not (every or width < STALLED * before):
             break
         before = width
     if found is None:
@@ -286,7 +287,7 @@ def _by_sampling(prediction: Prediction, rows: LinkRows, period: int, how: Setti
     for steps in _doubling(period):
         one, other = _two(prolonged(scenario, steps))
         near = wanted.at(one, few)
-        if settled is not None and wanted.apart(near, settled[1], 1.0) <= 3.0:
+        if settled is not None and wanted.apart(near, settled[1], 1.0) <= MOVED:
             at, _, gap = settled
             note = (
                 f"steady state: sampled at step {at}, {how.runs:,} runs; two samples of the same arrivals, from "
@@ -295,10 +296,10 @@ def _by_sampling(prediction: Prediction, rows: LinkRows, period: int, how: Setti
             cycle = f"the limit is a cycle of {period} steps, of which the mean is shown"
             return Limit(wanted.at(prolonged(scenario, at), how), period, None, (note, *[cycle] * (period > 1)))
         gap = wanted.apart(near, wanted.at(other, few), share)
-        settled = (steps, near, gap) if gap <= 0.1 else None
+        settled = (steps, near, gap) if gap <= CLOSE else None
     raise NoAnswerError(
-        f"no steady state: within {MOST_STEPS} steps two samples of the same arrivals that start far apart do not agree, "
-        "or the error grows; it mixes too slowly, or there is none"
+        f"no steady state: within {MOST_STEPS} steps two samples of the same arrivals that start far apart do not "
+        "agree, or the error grows; it mixes too slowly, or there is none"
     )
 
 

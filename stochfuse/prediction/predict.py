@@ -157,6 +157,8 @@ def predict(
         return _by_any(scenario, link, quantity, {**settings, "interval": interval, "steady": steady})
     method, how = _asked(scenario, method, quantity, settings)
     rows = link_rows(scenario, link)
+    if steady:
+        _room("limits").period_of(scenario, rows)  # what has no steady state is refused before any work
     found = _averaged(scenario.system, Items(rows), method, how, quantity)
     if found.faults:
         item, why = min(found.faults.items())

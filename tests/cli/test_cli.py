@@ -580,7 +580,7 @@ def test_an_input_is_never_overwritten(tmp_path):
         (["compare", "--methods", "general,naive", "--seed", "5"], "--seed: expected method monte-carlo, got general, naive"),
         (["crosscheck", "nowhere.csv", "--method", "simplified", "--max-graphs", "5"], "--max-graphs: expected method general or naive, got simplified"),
         (["compare", "fcs-demo"], "general cannot be compared here, leave it out of the methods"),
-        (["predict", "--steady", "--method", "general"], "steady: expected method simplified, got general"),
+        (["predict", "road-5", "--steady"], "a steady state needs a model, sensors and links that do not vary with the step"),
         (["predict", "--statistic", "std"], "--statistic std: expected --method general or naive, got simplified"),
         (["predict", "--method", "general", "--statistic", "mode"], "statistic: expected mean, variance, std, quantile:P"),
         (["predict", "--method", "general", "--statistic", "quantile:2"], "statistic: expected mean, variance, std, quantile:P"),
