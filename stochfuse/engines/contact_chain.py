@@ -188,10 +188,10 @@ class _Classes:
     @cached_property
     def possible(self) -> np.ndarray:
         """Whether a receiver of one class may ever hear a sender of another, (classes, classes)."""
-        there, link = np.asarray(reachable(self.network)[self.pairs]), self.rows.link
+        there, link = reachable(self.network)[self.pairs], self.rows.link
         if self.rows.uniform or self.rows.bursts is not None:
             return there
-        return there & (link > 0).reshape(-1, *link.shape[-2:]).any(axis=0)[self.pairs]
+        return there & np.any(link.reshape(-1, *link.shape[-2:]) > 0, axis=0)[self.pairs]
 
     @property
     def sizes(self) -> np.ndarray:

@@ -213,9 +213,9 @@ def _require_bounded(scenario: Scenario, rows: LinkRows, *, sampled: bool) -> No
                 f"that arrives shows it {where}"
             )
         raise NoAnswerError(
-            "the steady state cannot be sampled: the covariance, even the optimum's, has no variance over the outcomes, "
-            f"since the square of what the mode of F with eigenvalue {found[0]:.6g} adds grows by a factor of at least "
-            f"{found[1]:.6g} in every step {where}"
+            "the steady state cannot be sampled: the covariance, even the optimum's, has no variance over the "
+            f"outcomes, since the square of what the mode of F with eigenvalue {found[0]:.6g} adds grows by a factor "
+            f"of at least {found[1]:.6g} in every step {where}"
         )
 
 

@@ -224,6 +224,9 @@ RULES = (
     ),
 )
 """The table: what is not here is taken."""
+ENDING = ("links-per-step", "matrices-per-step")
+ENDLESS = "a model, sensors and links that do not vary with the step, or sensors with a period"
+"""Features that have no steady state, but that of sensors with periods, and what is expected in their place."""
 
 
 def pairs() -> list[tuple[str, str]]:
@@ -305,13 +308,10 @@ def require_endless(system: System, links: LinkRows, *, periodic: bool) -> None:
     ----------
     periodic : whether what varies does so with a period, as far as that can be told.
     """
+    goes_on = ("matrices-per-step",) if periodic else ()
     for feature in FEATURES:
-        if feature.name in ("links-per-step", *(() if periodic else ("matrices-per-step",))):
-            if feature.has(system, links):
-                raise UsageError(
-                    "a steady state needs a model, sensors and links that do not vary with the step, or sensors with a "
-                    f"period; got {feature.key}"
-                )
+        if feature.name in ENDING and feature.name not in goes_on and feature.has(system, links):
+            raise UsageError(f"a steady state needs {ENDLESS}; got {feature.key}")
 
 
 LATE, GAPS, BY_NAME = "messages that came late", "measurements that are missing", "sensors by name"

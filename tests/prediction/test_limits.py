@@ -141,13 +141,13 @@ def test_samples_without_chance_are_as_good_as_exact():
 def test_what_grows_without_end_has_none(method):
     """1 − µ of what is F² times as large after a step, at least 1/1.44 = 0.694 of it."""
     scenario = scalar(agents=2, F=1.2, steps=2, agent=[{"sensor": False}, {}])
-    with pytest.raises(sf.NoAnswerError, match="no steady state: the mode of F with eigenvalue 1.2 grows by a factor"):
+    with pytest.raises(sf.NoAnswerError, match=r"no steady state: the mode of F with eigenvalue 1.2 grows by a factor"):
         sf.predict(scenario, [0.3], method=method, steady=True, **({"runs": 10} if method == "monte-carlo" else {}))
 
 
 def test_an_error_without_a_variance_is_not_sampled():
     scenario = scalar(agents=2, F=1.2, steps=2, agent=[{"sensor": False}, {}])
-    with pytest.raises(sf.NoAnswerError, match="the steady state cannot be sampled: .* has no variance over the outc"):
+    with pytest.raises(sf.NoAnswerError, match=r"the steady state cannot be sampled: .* has no variance over the outc"):
         sf.predict(scenario, [0.5], method="monte-carlo", runs=10, steady=True)
 
 
