@@ -8,8 +8,11 @@ size r of S matters,
     broadcast  r → r + Binomial(n − r, µ)
     cyclic     r → r + Bernoulli(µ) while r < n
 
-and otherwise S itself, at most 2^n states: j ∉ S joins unless all its links into S fail, and different j are
-independent.
+and otherwise S itself: j ∉ S joins unless all its links into S fail, and different j are independent.  Agents that no
+link, delay or sensor tells apart are counted: any two of them may change places, so that of the sets with as many
+members of every such class each is as likely as its like, and what joins of a class is binomial.  Only states that can
+be reached are followed, on a line the intervals, on a ring the arcs.  So it is their number that counts, not n: 2^n
+where all are unlike and everybody hears everybody, Π(n_c + 1) in subnets of n_c, n(n+1)/2 on a line.
 
 Delays.  A message sent at step t that is under way for δ steps counts if its receiver's step-(t+δ) fusion is in the
 pedigree: if the receiver joined at least δ steps ago, counted backwards.  The state then holds the age of every member,
