@@ -198,6 +198,5 @@ def _warn(views: tuple[PredictionView, ...]) -> None:
         if text:
             typer.echo(f"warning: {text}", err=True)
             break
-    limits = [part.limit for view in views for part in view.parts if part.limit is not None]
-    for note in dict.fromkeys(note for limit in limits for note in limit.notes):
+    for note in dict.fromkeys(note for view in views for limit in view.limits for note in limit.notes):
         typer.echo(f"note: {note}", err=True)

@@ -20,7 +20,7 @@ from stochfuse.kalman.metrics import Metric, power
 from stochfuse.prediction.predict import predict
 from stochfuse.prediction.quantities import OVERCONFIDENT, expectation, noun, title
 from stochfuse.prediction.quantities import unit as unit_of
-from stochfuse.prediction.result import Prediction
+from stochfuse.prediction.result import Limit, Prediction
 from stochfuse.prediction.swept import Swept
 from stochfuse.report.plot import DASHES, MARKERS, below, direct, figure_class, shades, spread, titled
 from stochfuse.report.rows import Curves, Rows
@@ -152,6 +152,11 @@ class PredictionView:
         if values is None:
             return None
         return _finite(self._normalised(values, self.baseline and self.baseline.steady_values(self.metric, self.agent)))
+
+    @property
+    def limits(self) -> list[Limit]:
+        """What all parts tend to, if that was asked for."""
+        return [part.limit for part in self.parts if part.limit is not None]
 
     def steady_error(self) -> np.ndarray | None:
         """Standard errors of the steady values where they are sampled, shape (links,), or None."""
@@ -328,19 +333,22 @@ def predict_csv(view: PredictionView) -> str:
     metric = view.metric.name + ("/at-link-0" if view.baseline else "")
     metric = metric if view.statistic == "mean" else f"{view.statistic}({metric})"
     labels = (p.method, p.quantity, p.stage, p.nature, metric, view.unit, view.agent)
-    rows, ends = [], view.ends()
+    natures = [limit.prediction.nature for limit in view.limits for _ in limit.prediction.link]
+    rows, ends, steady_error = [], view.ends(), view.steady_error()
+    sampled = errors is not None or steady_error is not None
     for i, there in enumerate(view.there):
-        label = (*labels, *view.rows.record(i))
-        error: list[Any] = [()] * len(there) if errors is None else [(float(e),) for e in errors[i]]
+        record = view.rows.record(i)
+        error: list[Any] = [
+            ("",) * sampled if errors is None else (float(e),) for e in (there if errors is None else errors[i])
+        ]
         if ends is not None:
             error = [(float(low), float(high)) for low, high in zip(ends[0][i], ends[1][i], strict=True)]
-        rows += [(*label, int(view.steps[c]), float(values[i, c]), *error[c]) for c in np.flatnonzero(there)]
+        rows += [(*labels, *record, int(view.steps[c]), float(values[i, c]), *error[c]) for c in np.flatnonzero(there)]
         if steady is not None:
-            known = [float("nan")] * 2 if ends is not None else [] if errors is None else [0.0]
-            own = view.steady_error()
-            rows.append((*label, "steady", float(steady[i]), *(known if own is None else [float(own[i])])))
+            own = ("",) * len(error[0]) if steady_error is None else (float(steady_error[i]),)
+            rows.append((*labels[:3], natures[i], *labels[4:], *record, "steady", float(steady[i]), *own))
     what = ("method", "quantity", "stage", "nature", "metric", "unit", "agent")
-    more = ("standard_error",) if errors is not None else ("low", "high") if ends is not None else ()
+    more = ("low", "high") if ends is not None else ("standard_error",) * sampled
     return to_csv((*what, *view.rows.headings, "step", "value", *more), rows)
 
 
@@ -399,7 +407,7 @@ def predict_json(view: PredictionView) -> dict[str, Any]:
 def _steady_json(view: PredictionView, steady: np.ndarray) -> dict[str, Any]:
     """Return the steady state of every row, or of a cycle its mean, and how sure it is."""
     found: dict[str, Any] = {"steady": steady.tolist()}
-    limits = [part.limit for part in view.parts if part.limit is not None]
+    limits = view.limits
     if view.prediction.steady_bound is not None:
         worst = view.prediction.steady_bound.max(axis=1)
         found["steady_relative_bound"] = [float(b) if np.isfinite(b) else None for b in worst]
