@@ -25,9 +25,9 @@ TERMS = {
         "stochfuse solve --critical."
     ),
     "steady state": (
-        "What an expectation tends to as the steps go on; where sensors have periods a cycle, of which the mean is shown. "
-        "A fixed point of (54); of the optimum enclosed; anything else sampled after a burn-in, by which two samples of the "
-        "same arrivals, from starts far apart, no longer differ. See stochfuse predict --steady."
+        "What an expectation tends to as the steps go on; where sensors have periods a cycle, of which the mean is "
+        "shown. A fixed point of (54); of the optimum enclosed; anything else sampled after a burn-in, by which two "
+        "samples of the same arrivals, from starts far apart, no longer differ. See stochfuse predict --steady."
     ),
     "exact": (
         "An average over every outcome of which messages arrive, each with its probability; only rounding "
