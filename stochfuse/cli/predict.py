@@ -66,7 +66,7 @@ def predict(
     at: AtOption = None,
     normalise: Annotated[bool, option("Relative to link probability 0.", SHOWN + RARE, "--normalise")] = False,
     steady: Annotated[
-        bool, option("Add the steady state, P = g(P), with a proved bound (simplified).", SHOWN, "--steady")
+        bool, option("Add the steady state or cycle: proved bounds, or sampled after a burn-in.", SHOWN, "--steady")
     ] = False,
     interval: Annotated[
         str | None, option("Also the interval that the log behind the links supports: 95%.", SHOWN, metavar="P%")
@@ -134,7 +134,8 @@ def predict(
             if given_too:
                 raise UsageError(f"{flag}: expected without --interval")
     asked_for = {"steady": steady, "over": swept} | ({} if interval is None else {"interval": interval})
-    settings = {**asked_for, **settings_for([way], **given_settings)}
+    # a steady state may have to be sampled
+    settings = {**asked_for, **settings_for([way, *[MONTE_CARLO] * steady], **given_settings)}
     settings["shown"] = Shown(metrics=(chosen,), agent=chosen_agent, steps=steps)
     if swept and statistic != "mean":
         settings["one_by_one"] = True  # whose outcomes are kept
@@ -206,13 +207,5 @@ def _warn(views: tuple[PredictionView, ...]) -> None:
         if text:
             typer.echo(f"warning: {text}", err=True)
             break
-    if first.prediction.steady_bound is not None:
-        _tell_bound(first.prediction.steady_bound.max())
-
-
-def _tell_bound(worst: float) -> None:
-    if worst < 1:
-        text = f"the steady state is proved to lie within a relative {worst:.0e} of the value shown"
-    else:
-        text = "the steady state's residual is at rounding level, but no bound on it could be proved"
-    typer.echo(f"note: {text}", err=True)
+    for note in dict.fromkeys(note for view in views for limit in view.limits for note in limit.notes):
+        typer.echo(f"note: {note}", err=True)

@@ -8,8 +8,11 @@ size r of S matters,
     broadcast  r → r + Binomial(n − r, µ)
     cyclic     r → r + Bernoulli(µ) while r < n
 
-and otherwise S itself, at most 2^n states: j ∉ S joins unless all its links into S fail, and different j are
-independent.
+and otherwise S itself: j ∉ S joins unless all its links into S fail, and different j are independent.  Agents that no
+link, delay or sensor tells apart are counted: any two of them may change places, so that of the sets with as many
+members of every such class each is as likely as its like, and what joins of a class is binomial.  Only states that can
+be reached are followed, on a line the intervals, on a ring the arcs.  So it is their number that counts, not n: 2^n
+where all are unlike and everybody hears everybody, Π(n_c + 1) in subnets of n_c, n(n+1)/2 on a line.
 
 Delays.  A message sent at step t that is under way for δ steps counts if its receiver's step-(t+δ) fusion is in the
 pedigree: if the receiver joined at least δ steps ago, counted backwards.  The state then holds the age of every member,
@@ -48,13 +51,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations_with_replacement, product
+from functools import cached_property
+from itertools import product
 from math import comb, prod
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.engines.events import Event, events
+from stochfuse.engines.events import alike
 from stochfuse.engines.progress import listener
 from stochfuse.errors import UsageError
 from stochfuse.kalman.kernel import (
@@ -70,14 +74,14 @@ from stochfuse.kalman.kernel import (
     update_factor,
 )
 from stochfuse.scenario.model import Model, Sensor
-from stochfuse.scenario.network import LinkRows, Network, delivery_after_failures, number_of_senders
+from stochfuse.scenario.network import LinkRows, Network, delivery_after_failures, number_of_senders, reachable
 from stochfuse.scenario.system import System
 
 MOST_STATES = 4096
 """States of the chain."""
 NO_MEASUREMENT = 1e-150
-MOST_AGENTS, MOST_UNLIKE = 500, 12
-"""Agents that are alike, and agents that are not."""
+MOST_COUNTED = 1000
+"""Agents of a class up to which binomial coefficients fit a number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,14 +94,12 @@ class Contacts:
     starts : state before the exchange at the last step, for each group of agents.
     transition : T(s → s′) at a step, shape (rows, states, states), for some of the rows.
     constant : whether it is the same at every step.
-    falling : whether no count of a path is larger than one of an earlier step.
     """
 
     held: np.ndarray
     starts: tuple[int, ...]
     transition: Callable[[int, slice | np.ndarray], np.ndarray]
     constant: bool
-    falling: bool = True
 
 
 def contacts(
@@ -117,15 +119,12 @@ def contacts(
 
     Raises
     ------
-    UsageError
+    TooManyStatesError
         If the states are too many.
     """
-    bursty = rows.bursts is not None
-    oldest = network.steps - 1 if bursty else min(len(network.delay), network.steps) - 1
-    if len(set(kinds)) == 1 and rows.uniform and network.delays is None:
-        found = _of_counts(network, rows, oldest)
-    else:
-        found = _of_sets(network, rows, kinds, groups, oldest)
+    # a bursty link remembers for how long it has failed
+    remembered = network.steps if rows.bursts is not None else min(len(network.delay), network.steps)
+    found = _of_classes(network, rows, kinds, groups, remembered)
     return found if detects is None else _measured(found, detects[:, sorted(set(kinds))], network)
 
 
@@ -136,7 +135,7 @@ def _measured(all_held: Contacts, detects: np.ndarray, network: Network) -> Cont
         [range(r + 1) if missing[kind] else (r,) for kind, r in enumerate(counts)] for counts in all_held.held.tolist()
     ]
     if sum(prod(map(len, each)) for each in ranges) > MOST_STATES:
-        raise _too_many(network)
+        raise too_many_states(network)
     split = [(state, counts) for state, each in enumerate(ranges) for counts in product(*each)]
     of, counts = np.array([state for state, _ in split]), np.array([counts for _, counts in split])
     held = all_held.held[of]
@@ -152,7 +151,7 @@ def _measured(all_held: Contacts, detects: np.ndarray, network: Network) -> Cont
 
     # what is measured at the last step is no part of what an agent holds before its exchange
     starts = tuple(int(np.flatnonzero(of == start)[0]) for start in all_held.starts)
-    return Contacts(counts, starts, transition, constant=False, falling=False)
+    return Contacts(counts, starts, transition, constant=False)
 
 
 def by_age(delay: Sequence[float], µ: np.ndarray, burst: np.ndarray | None, oldest: int) -> np.ndarray:
@@ -166,140 +165,176 @@ def by_age(delay: Sequence[float], µ: np.ndarray, burst: np.ndarray | None, old
     return µ[:, None] * in_time if burst is None else delivery_after_failures(burst, in_time)
 
 
-def _of_counts(network: Network, rows: LinkRows, oldest: int) -> Contacts:
-    """Like agents and equal links.  A state is the ages of the members, of those whose links still matter."""
-    n = network.agents
-    if n > MOST_AGENTS:
-        raise UsageError(f"method 'optimal' takes at most {MOST_AGENTS} agents, got {n}")
-    states = list(_ages(network, oldest))
-    if len(states) > MOST_STATES:
-        raise _too_many(network)
-    number = {state: s for s, state in enumerate(states)}
-    targets = [
-        [number[_older(network, state, joined, oldest)] for joined in range(_joiners(network, state[0]) + 1)]
-        for state in states
-    ]
+@dataclass(frozen=True, eq=False)
+class _Classes:
+    """Agents in classes whose members no link and no sensor tells apart: then only how many of each are in matters.
 
-    def transition(step: int, some: slice | np.ndarray) -> np.ndarray:
-        µ = rows.at_step(step)
-        success = by_age(network.delay, µ, rows.chain(µ), oldest)[some]
-        T = np.zeros((len(success), len(states), len(states)))
-        for s, (_, ages) in enumerate(states):
-            failed = (1.0 - success[:, list(ages)]).prod(axis=1)
-            out = len(targets[s]) - 1
-            for joined, target in enumerate(targets[s]):
-                T[:, s, target] += comb(out, joined) * (1.0 - failed) ** joined * failed ** (out - joined)
-        return T
+    Parameters
+    ----------
+    network, rows : whose links.
+    members : agents of every class.
+    ages : ages 0 … that are told apart.
+    """
 
-    held = np.array([[r] for r, _ in states])
-    return Contacts(held, (number[1, (0,)],), transition, not rows.varies)
+    network: Network
+    rows: LinkRows
+    members: Sequence[tuple[int, ...]]
+    ages: int
+
+    @cached_property
+    def pairs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Receiver and sender that stand for a pair of classes, (classes, classes) each; of one agent, itself."""
+        first = np.array([c[0] for c in self.members])
+        receiver, sender = np.meshgrid(first, first, indexing="ij")
+        np.fill_diagonal(sender, [c[-1] for c in self.members])
+        return receiver, sender
+
+    @cached_property
+    def possible(self) -> np.ndarray:
+        """Whether a receiver of one class may ever hear a sender of another, (classes, classes)."""
+        there, link = reachable(self.network)[self.pairs], self.rows.link
+        if self.rows.uniform or self.rows.bursts is not None:
+            return there
+        return there & np.any(link.reshape(-1, *link.shape[-2:]) > 0, axis=0)[self.pairs]
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """How many agents each class has."""
+        return np.array([len(c) for c in self.members])
+
+    def failing(self, step: int, some: slice | np.ndarray, states: np.ndarray) -> np.ndarray:
+        """Probability that an agent of a class does not join, (rows, states, classes).
+
+        Parameters
+        ----------
+        states : (states, classes, ages) members of each class and age.
+        """
+        µ = self.rows.at_step(step)
+        lost: dict[tuple[Any, ...], np.ndarray] = {}
+        out = np.ones((len(µ[some]), len(states), len(self.members)))
+        everyone = states.sum(axis=1)
+        for (c, into), may in np.ndenumerate(self.possible.T):
+            if not may:
+                continue
+            receiver, sender = (int(each[into, c]) for each in self.pairs)
+            # equal links are worked out once
+            delay, key = self.network.delay_of(receiver, sender), () if self.rows.uniform else (receiver, sender)
+            if (delay, key) not in lost:
+                p = µ[(slice(None), *key)]
+                lost[delay, key] = 1.0 - by_age(delay, p, self.rows.chain(p), self.ages - 1)[some]
+            failed = lost[delay, key]
+            if self.network.architecture == "broadcast":  # heard by all or by none: by the oldest, too
+                out[:, :, c] = failed[:, self.ages - 1 - (everyone[:, ::-1] > 0).argmax(axis=1)]
+                continue
+            for age in range(self.ages):
+                present = np.flatnonzero(states[:, into, age])
+                out[:, present, c] *= failed[:, age, None] ** states[present, into, age]
+        return out
+
+    def following(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Classes that may join a state, and the states that may follow, (states, classes, ages).
+
+        Every number that may join of the first such class with every one of the next, the last one fastest.
+        """
+        inside = state.sum(axis=1)
+        joining = np.flatnonzero((inside < self.sizes) & self.possible[inside > 0].any(axis=0))
+        left = (self.sizes - inside)[joining]
+        number = prod((left + 1).tolist())
+        if number > MOST_STATES:
+            raise too_many_states(self.network)
+        joined = np.indices(left + 1).reshape(len(left), number).T
+        after = np.zeros((number, *state.shape), dtype=state.dtype)
+        after[:, :, 1:] = state[:, :-1]
+        after[:, :, -1] += state[:, -1]
+        after[:, joining, 0] += joined.astype(state.dtype)
+        return joining, self._alike(after) if self.ages > 1 else after
+
+    def _alike(self, states: np.ndarray) -> np.ndarray:
+        """Give one age to all members whose ages no longer matter: nobody is left whom they may hear, or who is heard
+        by some older one too.
+        """
+        inside = states.sum(axis=2)
+        waiting = inside < self.sizes
+        if self.network.architecture == "broadcast":
+            waits = np.broadcast_to(waiting.any(axis=1)[:, None], inside.shape)
+            oldest = self.ages - 1 - (states.sum(axis=1)[:, ::-1] > 0).argmax(axis=1)
+            same, age = np.ones_like(waits), np.where(waits, oldest[:, None], self.ages - 1)
+        else:
+            same, age = ~(waiting @ self.possible.T), np.full(inside.shape, self.ages - 1)
+        one = np.zeros_like(states)
+        np.put_along_axis(one, age[:, :, None], inside[:, :, None], axis=2)
+        return np.where(same[:, :, None], one, states)
 
 
-def _ages(network: Network, oldest: int) -> Iterator[tuple[int, tuple[int, ...]]]:
-    """States (r, ages that matter): of all members ad hoc, of the oldest in a broadcast, of the last one on a ring."""
-    n = network.agents
-    for r in range(1, n):
-        if oldest == 0 or network.architecture != "ad-hoc":
-            yield from ((r, (age,) * (r if network.architecture == "ad-hoc" else 1)) for age in range(oldest + 1))
-            continue
-        if comb(r + oldest, oldest) > MOST_STATES:
-            raise _too_many(network)
-        for ages in combinations_with_replacement(range(oldest, -1, -1), r):
-            yield r, ages
-    yield n, () if n > 1 else (0,)
-
-
-def _joiners(network: Network, r: int) -> int:
-    return min(network.agents - r, 1) if network.architecture == "cyclic" else network.agents - r
-
-
-def _older(
-    network: Network, state: tuple[int, tuple[int, ...]], joined: int, oldest: int
-) -> tuple[int, tuple[int, ...]]:
-    r, ages = state
-    if r + joined == network.agents:
-        return r + joined, () if network.agents > 1 else (0,)
-    older = tuple(min(age + 1, oldest) for age in ages)
-    if network.architecture == "ad-hoc":
-        older += (0,) * joined
-    elif network.architecture == "cyclic" and joined:
-        older = (0,)
-    return r + joined, older
-
-
-def _too_many(network: Network) -> UsageError:
-    return UsageError(
-        f"method 'optimal': the contact chain of {network.agents} agents has more than {MOST_STATES} states with these "
-        "links: expected fewer agents or steps, or equal links without delay; or use --method monte-carlo with "
-        "--estimator optimal"
-    )
-
-
-def _of_sets(
-    network: Network, rows: LinkRows, kinds: Sequence[int], groups: Sequence[tuple[int, ...]], oldest: int
+def _of_classes(
+    network: Network, rows: LinkRows, kinds: Sequence[int], groups: Sequence[tuple[int, ...]], ages: int
 ) -> Contacts:
-    """Unequal links or unlike agents.  A state is a number with a digit per agent: 0, or 1 + its age if it is in."""
-    n, base = network.agents, oldest + 2
-    if n > MOST_UNLIKE:
-        raise TooManyUnlikeError(
-            f"method 'optimal' takes at most {MOST_UNLIKE} agents where they or their links differ, got {n}: use "
-            "--method monte-carlo with --estimator optimal"
-        )
-    place = base ** np.arange(n, dtype=np.int64)
-    starts = [int(place[agents[0]]) for agents in groups]
-    found = np.array(sorted(set(starts)), dtype=np.int64)
-    while True:
-        digits = found[:, None] // place % base
-        new = [_subsets(_aged(d, base) @ place, place[d == 0]) for d in digits]
-        grown = np.unique(np.concatenate([found, *new]))
-        if len(grown) > MOST_STATES:
-            raise _too_many(network)
-        if len(grown) == len(found):
-            break
-        found = grown
-    targets = [np.searchsorted(found, t) for t in new]
+    """The states that may be reached.  A state is the numbers of members of every class and age."""
+    classes = _Classes(network, rows, alike(network, rows, kinds), ages)
+    class_of = {agent: c for c, members in enumerate(classes.members) for agent in members}
+    number: dict[bytes, int] = {}
+    found: list[np.ndarray] = []
+
+    def numbers(states: np.ndarray) -> np.ndarray:
+        """Number of every state, a new one of those that are new."""
+        size = states[0].nbytes
+        keys = np.ascontiguousarray(states).reshape(len(states), -1).view(f"V{size}").ravel().tolist()
+        out = np.array([number.setdefault(key, len(number)) for key in keys])
+        if len(number) > MOST_STATES:
+            raise too_many_states(network)
+        for place in np.flatnonzero(out >= len(found)):
+            if out[place] == len(found):
+                found.append(states[place])
+        return out
+
+    begin = np.zeros((len(groups), len(classes.members), ages), dtype=np.int16)
+    for place, agents in enumerate(groups):
+        begin[place, class_of[agents[0]], 0] = 1
+    starts = tuple(numbers(classes._alike(begin)).tolist())
+    follow: list[tuple[np.ndarray, np.ndarray]] = []
+    while len(follow) < len(found):
+        joining, after = classes.following(found[len(follow)])
+        follow.append((joining, numbers(after)))
+    states = np.array(found)
+    left = (classes.sizes - states.sum(axis=2)).tolist()
 
     def transition(step: int, some: slice | np.ndarray) -> np.ndarray:
-        drawn = events(network, rows, step)
-        success = [by_age(e.delay, e.probability, e.burst, oldest)[some] for e in drawn]
-        T = np.zeros((len(rows.link[some]), len(found), len(found)))
-        for s, state in enumerate(digits):
+        failed = classes.failing(step, some, states)
+        T = np.zeros((len(failed), len(states), len(states)))
+        for s, (joining, targets) in enumerate(follow):
             probability = np.ones((len(T), 1))
-            for sender in np.flatnonzero(state == 0):
-                failed = _failed(drawn, success, int(sender), state, len(T))
-                probability = np.concatenate(
-                    [probability * failed[:, None], probability * (1.0 - failed)[:, None]], axis=1
-                )
-            T[:, s, targets[s]] = probability
+            for c in joining:
+                share = _binomial(left[s][c], failed[:, s, c])
+                probability = (probability[:, :, None] * share[:, None]).reshape(len(T), -1)
+            T[:, s, targets] = probability
         return T
 
-    held = np.stack([((digits > 0) & (np.asarray(kinds) == kind)).sum(axis=1) for kind in sorted(set(kinds))], axis=1)
-    return Contacts(held, tuple(np.searchsorted(found, starts).tolist()), transition, not rows.varies)
+    kind_of = np.array([kinds[members[0]] for members in classes.members])
+    inside = states.sum(axis=2)
+    held = np.stack([inside[:, kind_of == kind].sum(axis=1) for kind in sorted(set(kinds))], axis=1).astype(int)
+    return Contacts(held, starts, transition, not rows.varies)
 
 
-def _aged(digits: np.ndarray, base: int) -> np.ndarray:
-    return np.where(digits > 0, np.minimum(digits + 1, base - 1), 0)
+def _binomial(n: int, failed: np.ndarray) -> np.ndarray:
+    """Probability that 0 … n of n join, each of which does not with a given probability, (rows, n + 1)."""
+    if n == 1:
+        return np.stack([failed, 1.0 - failed], axis=1)
+    joined, p = np.arange(n + 1), failed[:, None]
+    if n <= MOST_COUNTED:
+        return np.array([comb(n, j) for j in range(n + 1)], dtype=float) * (1.0 - p) ** joined * p ** (n - joined)
+    ways = np.concatenate([[0.0], np.cumsum(np.log(np.arange(n, 0, -1) / np.arange(1, n + 1)))])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logs = [np.where(m > 0, m * np.log(q), 0.0) for m, q in ((joined, 1.0 - p), (n - joined, p))]
+    return np.exp(ways + logs[0] + logs[1])
 
 
-def _subsets(state: Any, joining: np.ndarray) -> np.ndarray:
-    """State with every subset of the joining digits set to age 0; a later one is a higher bit of the place."""
-    total = np.array([state], dtype=np.int64)
-    for digit in joining:
-        total = np.concatenate([total, total + digit])
-    return total
-
-
-def _failed(
-    drawn: Sequence[Event], success: Sequence[np.ndarray], sender: int, state: np.ndarray, rows: int
-) -> np.ndarray:
-    """Probability that a sender does not join a state, (rows,)."""
-    failed = np.ones(rows)
-    for event, by_ages in zip(drawn, success, strict=True):
-        if event.sender == sender:
-            age = max((int(state[i]) for i in event.receivers), default=0) - 1
-            if age >= 0:
-                failed = failed * (1.0 - by_ages[:, age])
-    return failed
+def too_many_states(network: Network) -> TooManyStatesError:
+    """Return the error of a chain that is too large."""
+    return TooManyStatesError(
+        f"method 'optimal': the contact chain of {network.agents} agents has more than {MOST_STATES} states with these "
+        "links: expected fewer agents or steps, or links and sensors that tell fewer of them apart; or use --method "
+        "monte-carlo with --estimator optimal"
+    )
 
 
 def by_number(system: System, links: LinkRows) -> bool:
@@ -350,6 +385,7 @@ class LosslessFilter(NamedTuple):
     shared : whether all agents start from one common estimate.
     error : (d, 1) initial error that all agents share, or None.
     numbers : what the numbers go through.
+    first : covariance to start from by the counts held, in the place of that of first estimates.
     """
 
     model: Model
@@ -358,6 +394,11 @@ class LosslessFilter(NamedTuple):
     shared: bool
     error: np.ndarray | None = None
     numbers: Numbers = AsTheyAre()
+    first: Mapping[tuple[int, ...], np.ndarray] | None = None
+
+    def begins(self, counts: np.ndarray) -> list[int]:
+        """Places of the counts that a path may start with: at step 1 everybody has a first estimate."""
+        return np.flatnonzero(counts.any(axis=1) | (self.first is not None)).tolist()
 
     @classmethod
     def of(cls, system: System) -> LosslessFilter:
@@ -367,7 +408,8 @@ class LosslessFilter(NamedTuple):
     def start(self, counts: np.ndarray) -> AlongPath:
         """Estimate from so many agents' initial ones, and what it leaves of the error."""
         x = np.zeros((self.model.dimension, 1)) if self.error is None else self.error
-        P = (self.P0 if self.shared else self.P0 / counts.sum())[None]
+        first = self.P0 if self.shared or self.first is not None else self.P0 / counts.sum()
+        P = (first if self.first is None else self.first[tuple(counts.tolist())])[None]
         return AlongPath(np.broadcast_to(x, (*P.shape[:-1], 1)), P if self.scalar else self.numbers.factor(P))
 
     def after(self, before: AlongPath, counts: np.ndarray, step: int) -> AlongPath:
@@ -430,8 +472,8 @@ class Chain(NamedTuple):
     rounding: np.ndarray | float = 0.0
 
 
-class TooManyUnlikeError(UsageError):
-    """More unlike agents than sets of them can be gone through."""
+class TooManyStatesError(UsageError):
+    """More states of the chain than can be gone through."""
 
 
 class TooManyPathsError(UsageError):
@@ -478,10 +520,10 @@ def leading(
 ) -> Iterator[tuple[Any, np.ndarray, np.ndarray]]:
     """Classes of paths that may lead to the states here: the class, which of its paths do, and their weight here."""
     rows_here = T[:, here]
+    from_here = np.asarray(rows_here.any(axis=(0, 1)))
     for before, paths in classes.items():
-        block = rows_here[:, :, states[before]]
-        if block.any():
-            weight = block @ paths.weight
+        if from_here[states[before]].any():
+            weight = rows_here[:, :, states[before]] @ paths.weight
             alive = np.flatnonzero(weight.any(axis=(0, 1)))
             if len(alive):
                 yield paths, alive, weight[:, :, alive]
@@ -528,8 +570,7 @@ def over_paths(
     paths, before = 0, np.empty(0)
     for step, T in enumerate(transitions(contacts, steps, some), start=1):
         if step == 1:
-            # at step 1 everybody has a first estimate
-            ones = {c: np.ones((len(T), len(states[c]), 1)) for c in range(len(counts)) if counts[c].any()}
+            ones = {c: np.ones((len(T), len(states[c]), 1)) for c in given.begins(counts)}
             classes = {c: Class(given.start(counts[c]), weight) for c, weight in ones.items()}
         else:
             classes = _grown(given, classes, before, counts, states, step)
@@ -585,8 +626,7 @@ def _grown(
 def check_size(paths: float, numbers: float = 0.0) -> None:
     """Raise TooManyPathsError beyond `MOST_PATHS` paths or `MOST_NUMBERS` weights."""
     if paths > MOST_PATHS or numbers > MOST_NUMBERS:
-        number = f"{paths:.3g} paths or more" if paths < np.inf else "too many paths, which unlike agents do not order"
         raise TooManyPathsError(
-            f"the contact chain has {number}, at most {MOST_PATHS} are gone through one by one: use "
+            f"the contact chain has {paths:.3g} paths or more, at most {MOST_PATHS} are gone through one by one: use "
             "fewer steps or agents, or --method monte-carlo with --estimator optimal"
         )

@@ -16,7 +16,7 @@ which the links can be good and bad.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations
 from math import prod
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -25,7 +25,7 @@ import numpy as np
 
 from stochfuse.errors import UsageError
 from stochfuse.estimators.protocol import Late
-from stochfuse.scenario.network import LinkRows, Network, possible_senders
+from stochfuse.scenario.network import LinkRows, Network, possible_senders, reachable
 from stochfuse.scenario.system import Detection
 
 if TYPE_CHECKING:
@@ -105,24 +105,75 @@ def relabellings(network: Network, rows: LinkRows, sources: Sequence[int]) -> li
     n = network.agents
     if n > MOST_AGENTS_RELABELLED:
         return [tuple(range(n))]
+    told = _told(network, rows, sources)
+    return [p for p in permutations(range(n)) if _changes_nothing(told, p)]
+
+
+def alike(network: Network, rows: LinkRows, sources: Sequence[int]) -> list[tuple[int, ...]]:
+    """Classes of agents of which any two may change places with nothing else changed, as sorted groups.
+
+    Such transpositions make an equivalence: (a c) = (a b)(b c)(a b).
+    """
+    n = network.agents
+    if rows.uniform and network.delays is None and (network.architecture != "cyclic" or n < 3):
+        return [tuple(i for i in range(n) if sources[i] == kind) for kind in dict.fromkeys(sources)]
+    told = _told(network, rows, sources)
+    ordered = zip(np.sort(told, axis=2).swapaxes(0, 1), np.sort(told, axis=1).transpose(2, 0, 1), strict=True)
+    found: dict[tuple[bytes, bytes], list[list[int]]] = {}
+    for i, (heard, hears) in enumerate(ordered):
+        candidates = found.setdefault((heard.tobytes(), hears.tobytes()), [])
+        same = next((c for c in candidates if _twins(told, c[0], i)), None)
+        if same is None:
+            candidates.append([i])
+        else:
+            same.append(i)
+    return sorted(tuple(c) for candidates in found.values() for c in candidates)
+
+
+def some_relabellings(network: Network, rows: LinkRows, sources: Sequence[int]) -> list[tuple[int, ...]]:
+    """Relabellings of many agents that are easily found: of pairs alike, of all to the next, of all backwards."""
+    n = network.agents
+    told, everyone = _told(network, rows, sources), list(range(n))
+    found = [tuple(everyone[1:] + everyone[:1]), tuple(everyone[::-1])]
+    found = [p for p in found if _changes_nothing(told, p)]
+    for first, *others in alike(network, rows, sources):
+        for other in others:
+            p = list(everyone)
+            p[first], p[other] = other, first
+            found.append(tuple(p))
+    return [tuple(everyone), *found]
+
+
+def _told(network: Network, rows: LinkRows, sources: Sequence[int]) -> np.ndarray:
+    """All by which agents and links are told apart, (features, n, n): sources on the diagonal."""
+    n, there = network.agents, reachable(replace(network, hears=None))
     steps = range(1, network.steps + 1 if rows.varies else 2)
-    link = np.zeros((len(steps), len(rows.link), n, n))
-    for k, step in enumerate(steps):
-        for i, (senders, µ) in enumerate(
-            zip(possible_senders(network.architecture, n), np.moveaxis(rows.matrices(network, step), 1, 0), strict=True)
-        ):
-            link[k][:, i, senders] = µ + 1.0  # told apart from a link that does not exist
-    delays = np.zeros((n, n, 0)) if network.delays is None else np.array(network.delays)
-    found = []
-    for p in permutations(range(n)):
-        order = list(p)
-        if (
-            all(sources[a] == sources[i] for i, a in enumerate(p))
-            and (link == link[..., order, :][..., order]).all()
-            and (delays == delays[order][:, order]).all()
-        ):
-            found.append(p)
-    return found
+    link = [rows.at_step(step) for step in steps]
+    link = [np.broadcast_to(µ[:, None, None], (len(µ), n, n)) if rows.uniform else µ for µ in link]
+    # told apart from a link that does not exist
+    features = [*np.where(there, np.concatenate(link) + 1.0, 0.0)]
+    if network.delays is not None:
+        numbers = {delay: number for number, delay in enumerate(sorted({d for row in network.delays for d in row}))}
+        features.append(np.array([[float(numbers[delay]) for delay in row] for row in network.delays]) * there)
+    return np.stack([np.where(np.eye(n, dtype=bool), np.asarray(sources, dtype=float), f) for f in features])
+
+
+def _changes_nothing(told: np.ndarray, p: Sequence[int]) -> bool:
+    order = list(p)
+    return bool((told == told[:, order][:, :, order]).all())
+
+
+def _twins(told: np.ndarray, a: int, b: int) -> bool:
+    """Whether two agents may change places: nobody else can tell them apart, nor they themselves."""
+    others = np.ones(told.shape[-1], dtype=bool)
+    others[[a, b]] = False
+    rows, columns = told[:, [a, b]], told[:, :, [a, b]]
+    return bool(
+        (rows[:, 0, others] == rows[:, 1, others]).all()
+        and (columns[:, others, 0] == columns[:, others, 1]).all()
+        and (told[:, a, b] == told[:, b, a]).all()
+        and (told[:, a, a] == told[:, b, b]).all()
+    )
 
 
 def orbits(n: int, permutations: Sequence[tuple[int, ...]]) -> list[tuple[int, ...]]:
@@ -131,7 +182,8 @@ def orbits(n: int, permutations: Sequence[tuple[int, ...]]) -> list[tuple[int, .
     for p in permutations:
         for i, a in enumerate(p):
             low, high = sorted((group[i], group[a]))
-            group = [low if g == high else g for g in group]
+            if low < high:
+                group = [low if g == high else g for g in group]
     return [tuple(i for i in range(n) if group[i] == g) for g in sorted(set(group))]
 
 

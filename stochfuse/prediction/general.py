@@ -32,6 +32,7 @@ from stochfuse.engines.events import (
     monomials,
     orbits,
     relabellings,
+    some_relabellings,
     weights_for,
 )
 from stochfuse.engines.precision import NO_DIGIT, PROMISED, MovedSources, change, moved_claims, notes, reach, suspects
@@ -735,9 +736,11 @@ class _Batch(NamedTuple):
 def groups_alike(
     network: Network, rows: LinkRows, labels: Sequence[int], permutations: Sequence[tuple[int, ...]]
 ) -> tuple[tuple[int, ...], ...]:
-    """Groups of agents that some relabelling takes into one another; of too many to look, all or none."""
-    if network.agents > MOST_AGENTS_RELABELLED and rows.uniform and len(set(labels)) == 1 and network.delays is None:
-        return (tuple(range(network.agents)),)
+    """Groups of agents that some relabelling takes into one another; of many agents, one that is easily found."""
+    if network.agents > MOST_AGENTS_RELABELLED:
+        if rows.uniform and len(set(labels)) == 1 and network.delays is None:
+            return (tuple(range(network.agents)),)
+        permutations = some_relabellings(network, rows, labels)
     return tuple(orbits(network.agents, permutations))
 
 

@@ -15,12 +15,12 @@ from dataclasses import replace
 import numpy as np
 
 from stochfuse.engines.contact_chain import (
-    MOST_UNLIKE,
+    MOST_STATES,
     Chain,
     Contacts,
     LosslessFilter,
     TooManyPathsError,
-    TooManyUnlikeError,
+    TooManyStatesError,
     by_counts,
     by_number,
     check_size,
@@ -33,7 +33,6 @@ from stochfuse.engines.contact_chain import (
 from stochfuse.engines.enclosure import enclosed_optimum
 from stochfuse.engines.events import relabellings
 from stochfuse.engines.precision import PROMISED, Moving, change, notes, reach, suspects
-from stochfuse.errors import UsageError
 from stochfuse.kalman.metrics import Moments
 from stochfuse.prediction import sampled
 from stochfuse.prediction.general import groups_alike
@@ -45,6 +44,8 @@ from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.registry import CHAIN, OPTIMAL
 from stochfuse.scenario.system import Items, Noises, System
 
+LOOSE = 0.01
+"""Relative half-width from which on a sample is worth more than bounds."""
 BLOCK = 1 << 19
 """Numbers that covariances, weights or transitions of a block of items take."""
 
@@ -61,8 +62,8 @@ def averaged(system: System, items: Items, how: Settings, errors: bool) -> Avera
     groups = groups_of(system, links)
     try:
         chain = contacts(network, links, system.sensor_of, groups, system.detects)
-    except TooManyUnlikeError:
-        return _sampled(system, items, how, errors)
+    except TooManyStatesError:
+        return _sampled(system, items, how, errors, f"the contact chain has more than {MOST_STATES} states")
     paths = number_of_paths(network) if counted(system, links) else None
     try:
         if paths is not None:
@@ -71,9 +72,16 @@ def averaged(system: System, items: Items, how: Settings, errors: bool) -> Avera
     except TooManyPathsError:
         if not items.noises.common:
             return joined_items([(m, averaged(alone, some, how, errors)) for m, alone, some in items.by_noises(system)])
-        found = _with_rounding(system, Noises(), lambda given: enclosed_optimum(given, chain, system.steps, len(items)))
-    if errors and found.bias is None:
-        raise UsageError("the optimum is only enclosed in bounds: expected quantity optimal, or fewer agents or steps")
+        if errors:
+            return _sampled(system, items, how, errors, "the optimum's bias is followed along every path only")
+        try:
+            found = _with_rounding(
+                system, Noises(), lambda given: enclosed_optimum(given, chain, system.steps, len(items))
+            )
+        except TooManyPathsError as error:
+            return _sampled(system, items, how, errors, str(error))
+        if float(found.bound.max()) > LOOSE:
+            return _sampled(system, items, how, errors, f"bounds on the optimum would be {found.bound.max():.1g} apart")
     bound, far = float(found.bound.max()), np.broadcast_to(found.rounding, len(items))
     said = [f"the optimum is proved to lie within a relative {bound:.0e} of the value shown"] if bound else []
     return Averaged(
@@ -88,11 +96,10 @@ def averaged(system: System, items: Items, how: Settings, errors: bool) -> Avera
     )
 
 
-def _sampled(system: System, items: Items, how: Settings, errors: bool) -> Averaged:
-    """Sample the optimum of more unlike agents than a chain takes."""
+def _sampled(system: System, items: Items, how: Settings, errors: bool, why: str) -> Averaged:
+    """Sample the optimum where a chain does not take it, and say why."""
     found = sampled.averaged(system, items, replace(how, estimator=OPTIMAL), errors)
-    said = f"more than {MOST_UNLIKE} unlike agents or links: sampled, {how.runs:,} runs; ± standard error"
-    return found._replace(notes=(*found.notes, said))
+    return found._replace(notes=(*found.notes, f"{why}: sampled, {how.runs:,} runs; ± standard error"))
 
 
 def _every_path(system: System, items: Items, chain: Contacts, paths: int | None) -> Chain:

@@ -124,7 +124,7 @@ def predict(
         "consistency", actual / claimed, more than 1 where the rule is overconfident;
         "bias", what is left of the scenario's known initial error (initial.error);
         "rms", the root of the mean squared error, noise and bias.
-    steady : also solve for the steady state (simplified).
+    steady : also find what it tends to, see `stochfuse.prediction.limits`: a steady state, or a cycle.
     interval : a probability (0.95, "95%"): also what the log behind the scenario's links leaves unknown, see
         `Prediction.interval`.
     over : values of one or two numbers of the scenario by their paths, {"network.delay": [0, 1, 2]}: what is
@@ -163,14 +163,12 @@ def predict(
         and settings.get("precision") is None
         and quantity != registry.OPTIMAL
     ):
-        return _by_any(scenario, link, quantity, {**settings, "interval": interval})
+        return _by_any(scenario, link, quantity, {**settings, "interval": interval, "steady": steady})
     method, how = _asked(scenario, method, quantity, settings)
-    if steady and method != SIMPLIFIED:
-        raise UsageError(f"steady: expected method simplified, got {method}")
-    if steady and quantity != "claimed":
-        raise UsageError(f"steady: expected quantity claimed, got {quantity}")
     rows = link_rows(scenario, link)
-    if how.precision is not None and how.exact_first:
+    if steady:
+        _room("limits").period_of(scenario, rows)  # what has no steady state is refused before any work
+    elif how.precision is not None and how.exact_first:
         exactly = _exactly(scenario, link, how, quantity)
         if exactly is not None:
             return exactly
@@ -183,8 +181,7 @@ def predict(
         prediction = replace(prediction, supported=_supported(scenario, link, interval, method, quantity, settings))
     if not steady:
         return prediction
-    fixed = _room("steady_state").steady_state(scenario, rows)
-    return prediction.with_steady(fixed.P, fixed.bound)
+    return replace(prediction, limit=_room("limits").limit(prediction, rows, how))
 
 
 def _exactly(scenario: Scenario, link: Any, how: Settings, quantity: str) -> Prediction | None:

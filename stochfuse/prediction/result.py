@@ -45,8 +45,7 @@ class Prediction(Result):
     outcomes : all outcomes, where they were enumerated: for distributions and polynomials.
     sampled : the sample, where it was drawn: for standard errors.
     meta : further facts for programs.
-    steady : (links, groups, d, d) steady-state covariance if it was asked for.
-    steady_bound : (links, groups) proved relative error bound of `steady`.
+    limit : the steady state, or cycle, if it was asked for.
     noises : of each item, where items have noises of their own.
     supported : link probabilities that the log supports and the prediction of them, if an interval was asked for.
     """
@@ -67,8 +66,7 @@ class Prediction(Result):
     outcomes: Outcomes | None = field(default=None, repr=False)
     sampled: Sampled | None = field(default=None, repr=False)
     meta: Mapping[str, Any] = field(default_factory=dict)
-    steady: np.ndarray | None = None
-    steady_bound: np.ndarray | None = field(default=None, repr=False)
+    limit: Limit | None = None
     supported: tuple[Posterior, Prediction] | None = field(default=None, repr=False)
     noises: Noises | None = field(default=None, repr=False)
 
@@ -109,7 +107,9 @@ class Prediction(Result):
         """
         if matrix(quantity, self.moments) is None:
             raise UsageError(f"quantity {quantity}: was not computed; predict it with quantity='{quantity}'")
-        return replace(self, quantity=quantity)
+        limit = self.limit
+        limit = None if limit is None else replace(limit, prediction=limit.prediction.shown_as(quantity))
+        return replace(self, quantity=quantity, limit=limit)
 
     def values(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray:
         """Return a metric of the covariance (or what the quantity makes of it), shape (links, steps).
@@ -200,17 +200,27 @@ class Prediction(Result):
             return int(self.group_of[agent - 1])
         raise UsageError(f"agent: expected mean, worst, best or a number from 1 to {len(self.group_of)}, got '{agent}'")
 
+    @property
+    def steady(self) -> np.ndarray | None:
+        """Covariance in the steady state, (links, groups, d, d), of a cycle its mean; None if it was not asked for."""
+        return None if self.limit is None else self.limit.last(self.limit.prediction.by_group).mean(axis=1)
+
+    @property
+    def steady_bound(self) -> np.ndarray | None:
+        """Proved relative error bound of `steady`, (links, groups); None where there is none."""
+        return None if self.limit is None else self.limit.bound
+
     def steady_values(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray | None:
-        """Return a metric of the steady state, shape (links,), or None if none was computed."""
-        return None if self.steady is None else self._reduce(Moments(self.steady), of, agent)
+        """Return a metric of the steady state, shape (links,), of a cycle its mean; None if none was computed."""
+        return None if self.limit is None else self.limit.values(of, agent).mean(axis=1)
+
+    def steady_error(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray | None:
+        """Return the standard error of `steady_values`, shape (links,); None if it was not sampled."""
+        return None if self.limit is None else self.limit.standard_error(of, agent)
 
     def table(self, of: str = "trace", agent: int | str = "mean") -> str:
         """Return the table as text, as `stochfuse predict` prints it."""
         return stochfuse.shown("text_of", self, of=of, agent=agent)
-
-    def with_steady(self, P: np.ndarray, bound: np.ndarray) -> Prediction:
-        """Return the same with its steady state."""
-        return replace(self, steady=P, steady_bound=bound)
 
     def _reduce(self, moments: Moments, of: str | Metric, agent: int | str) -> np.ndarray:
         m = metric(of, self.scenario.model) if isinstance(of, str) else of
@@ -225,3 +235,37 @@ class Prediction(Result):
             return M[..., self._group(agent), :, :]
         share = np.bincount(self.group_of, minlength=M.shape[-3]) / len(self.group_of)
         return M[..., 0, :, :] if M.shape[-3] == 1 else np.tensordot(M, share, axes=(M.ndim - 3, 0))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Limit:
+    """What a prediction tends to: a steady state, or a cycle of as many steps as what is given repeats itself in.
+
+    Parameters
+    ----------
+    prediction : whose last steps are those of the cycle; its nature is that of the limit.
+    period : steps of the cycle; 1 where nothing varies.  Its phases are the steps k ≡ 1, 2 … (mod period).
+    bound : (links, groups) proved relative error bound, or None.
+    notes : how it was found, one sentence each.
+    """
+
+    prediction: Prediction
+    period: int = 1
+    bound: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
+
+    def last(self, values: np.ndarray) -> np.ndarray:
+        """What a prediction has at the phases, (links, period, …)."""
+        return values[:, -self.period :]
+
+    def values(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray:
+        """Return a metric at every phase, shape (links, period)."""
+        return self.last(self.prediction.values(of, agent))
+
+    def standard_error(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray | None:
+        """Return the standard error of the phases' mean, shape (links,), or None if nothing was sampled.
+
+        That of the phases, averaged: how far they depend on one another is not known, and it is no more than that.
+        """
+        errors = self.prediction.standard_error(of, agent)
+        return None if errors is None else self.last(errors).mean(axis=1)

@@ -201,6 +201,14 @@ class Swept(Result):
         found = [values for values in self.each(lambda part: part.steady_values(of, agent)) if values is not None]
         return np.concatenate(found) if found else None
 
+    def steady_error(self, of: str | Metric = "trace", agent: int | str = "mean") -> np.ndarray | None:
+        """Return the standard error of `steady_values`, 0 where nothing was sampled; None if nothing was at any."""
+        errors = [part.steady_error(of, agent) for part in self.parts]
+        if all(error is None for error in errors):
+            return None
+        pairs = zip(errors, self.parts, strict=True)
+        return np.concatenate([np.zeros(len(part.link)) if e is None else e for e, part in pairs])
+
     def table(self, of: str | None = None, agent: int | str = "mean") -> str:
         """Return the table as text, as `stochfuse predict --over` prints it."""
         return stochfuse.shown("text_of", self, of=of, agent=agent)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse.engines.contact_chain import MOST_UNLIKE
+from stochfuse.engines.contact_chain import MOST_STATES
 from stochfuse.errors import UsageError
 from stochfuse.kalman.metrics import Metric, metric
 from stochfuse.prediction.predict import choose
@@ -93,11 +93,11 @@ class Question:
 
 
 def _not_sampled(predictions: Sequence[Prediction]) -> None:
-    """Raise UsageError where the optimum of many unlike agents is sampled."""
+    """Raise UsageError where the optimum is sampled, of agents of which a chain would have too many states."""
     if any(p.sampled is not None for p in predictions):
         raise UsageError(
             "method optimal: the optimum of so many unlike agents or links is sampled, and what is asked backwards of "
-            f"it would follow the sample's errors: expected at most {MOST_UNLIKE} agents, or like ones with equal links"
+            f"it would follow the sample's errors: expected a contact chain of at most {MOST_STATES} states"
         )
 
 

@@ -24,6 +24,11 @@ TERMS = {
         "1/|eigenvalue|^2 where one message shows the state, more where it shows a part (Sinopoli et al. 2004). See "
         "stochfuse solve --critical."
     ),
+    "steady state": (
+        "What an expectation tends to as the steps go on; where sensors have periods a cycle, of which the mean is "
+        "shown. A fixed point of (54); of the optimum enclosed; anything else sampled after a burn-in, by which two "
+        "samples of the same arrivals, from starts far apart, no longer differ. See stochfuse predict --steady."
+    ),
     "exact": (
         "An average over every outcome of which messages arrive, each with its probability; only rounding "
         "is left, and its reach is checked."

@@ -45,6 +45,7 @@ def _matrix_table() -> Table:
     title = (
         "Features of a scenario that an estimator averaged by an engine does not take",
         "known features: " + ", ".join(f.name for f in capabilities.FEATURES),
+        f"a steady state (--steady) needs {capabilities.ENDLESS}",
         "reasons: --format json",
     )
     return Table(title, ("estimator", "method", "does not take"), (), tuple(rows))

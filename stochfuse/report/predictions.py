@@ -20,7 +20,7 @@ from stochfuse.kalman.metrics import Metric, power
 from stochfuse.prediction.predict import predict
 from stochfuse.prediction.quantities import OVERCONFIDENT, expectation, noun, title
 from stochfuse.prediction.quantities import unit as unit_of
-from stochfuse.prediction.result import Prediction
+from stochfuse.prediction.result import Limit, Prediction
 from stochfuse.prediction.swept import Swept
 from stochfuse.report.plot import DASHES, MARKERS, below, direct, figure_class, shades, spread, titled
 from stochfuse.report.rows import Curves, ResultRows
@@ -29,6 +29,8 @@ from stochfuse.scenario.registry import OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.registry import title as method_title
 
 SCHEMA = "stochfuse.prediction/1"
+STEADY = ("steady", "steady_relative_bound", "steady_standard_error", "steady_nature", "steady_cycle")
+"""What JSON says of a steady state."""
 STATISTICS = {
     "variance": "variance over the outcomes of the {what}",
     "std": "standard deviation over the outcomes of the {what}",
@@ -152,6 +154,26 @@ class PredictionView:
         if values is None:
             return None
         return _finite(self._normalised(values, self.baseline and self.baseline.steady_values(self.metric, self.agent)))
+
+    @property
+    def limits(self) -> list[Limit]:
+        """What all parts tend to, if that was asked for."""
+        return [part.limit for part in self.parts if part.limit is not None]
+
+    def steady_error(self) -> np.ndarray | None:
+        """Standard errors of the steady values where they are sampled, shape (links,), or None."""
+        errors = self.prediction.steady_error(self.metric, self.agent)
+        by = self.baseline and self.baseline.steady_values(self.metric, self.agent)
+        return None if errors is None else self._normalised(errors, by)
+
+    @property
+    def steady_cells(self) -> list[str] | None:
+        """The steady values as they are shown, of every row."""
+        values, errors = self.steady(), self.steady_error()
+        if values is None:
+            return None
+        each = zip(values, np.zeros(len(values)) if errors is None else errors, strict=True)
+        return [number(value, self.digits) + (f" ±{error:.2g}" if error else "") for value, error in each]
 
     def _normalised(self, values: np.ndarray, by: np.ndarray | None) -> np.ndarray:
         if by is None:
@@ -278,7 +300,7 @@ def report(views: Sequence[PredictionView]) -> Report:
 
 def predict_table(view: PredictionView) -> Table:
     """Return rows of link probabilities (or cases) against columns of steps."""
-    values, errors, steady, ends = view.values(), view.errors(), view.steady(), view.ends()
+    values, errors, steady, ends = view.values(), view.errors(), view.steady_cells, view.ends()
     columns = [f"k={k}" for k in view.steps] + (["steady"] if steady is not None else [])
     rows = []
     for i, there in enumerate(view.there):
@@ -289,7 +311,7 @@ def predict_table(view: PredictionView) -> Table:
         if ends is not None:
             shown = [f"{value} {_between(*pair, view.digits)}" for value, *pair in zip(shown, *(e[i] for e in ends))]  # noqa: B905
         shown = [value if is_there else "" for value, is_there in zip(shown, there, strict=True)]
-        rows.append((*view.rows.cells(i), *shown, *([] if steady is None else [number(steady[i], view.digits)])))
+        rows.append((*view.rows.cells(i), *shown, *([] if steady is None else [steady[i]])))
     return Table((view.what, view.whom, view.how), view.rows.keys, tuple(columns), tuple(rows), over="k")
 
 
@@ -319,17 +341,22 @@ def predict_csv(view: PredictionView) -> str:
     metric = view.metric.name + ("/at-link-0" if view.baseline else "")
     metric = metric if view.statistic == "mean" else f"{view.statistic}({metric})"
     labels = (p.method, p.quantity, p.stage, p.nature, metric, view.unit, view.agent)
-    rows, ends = [], view.ends()
+    natures = [limit.prediction.nature for limit in view.limits for _ in limit.prediction.link]
+    rows, ends, steady_error = [], view.ends(), view.steady_error()
+    sampled = errors is not None or steady_error is not None
     for i, there in enumerate(view.there):
-        label = (*labels, *view.rows.record(i))
-        error: list[Any] = [()] * len(there) if errors is None else [(float(e),) for e in errors[i]]
+        record = view.rows.record(i)
+        error: list[Any] = [
+            ("",) * sampled if errors is None else (float(e),) for e in (there if errors is None else errors[i])
+        ]
         if ends is not None:
             error = [(float(low), float(high)) for low, high in zip(ends[0][i], ends[1][i], strict=True)]
-        rows += [(*label, int(view.steps[c]), float(values[i, c]), *error[c]) for c in np.flatnonzero(there)]
+        rows += [(*labels, *record, int(view.steps[c]), float(values[i, c]), *error[c]) for c in np.flatnonzero(there)]
         if steady is not None:
-            rows.append((*label, "steady", float(steady[i])))
+            own = ("",) * len(error[0]) if steady_error is None else (float(steady_error[i]),)
+            rows.append((*labels[:3], natures[i], *labels[4:], *record, "steady", float(steady[i]), *own))
     what = ("method", "quantity", "stage", "nature", "metric", "unit", "agent")
-    more = ("standard_error",) if errors is not None else ("low", "high") if ends is not None else ()
+    more = ("low", "high") if ends is not None else ("standard_error",) * sampled
     return to_csv((*what, *view.rows.headings, "step", "value", *more), rows)
 
 
@@ -380,11 +407,25 @@ def predict_json(view: PredictionView) -> dict[str, Any]:
         if polynomials is not None:
             # E(µ) = sum over c of coefficients[c] µ^c (1−µ)^(L−c), L + 1 = len(coefficients), one list per step
             result["bernstein"] = [polynomials[k - 1].tolist() for k in view.steps]
-    if steady is not None and p.steady_bound is not None:
-        worst = p.steady_bound.max(axis=1)
-        result["steady"] = steady.tolist()
-        result["steady_relative_bound"] = [float(b) if np.isfinite(b) else None for b in worst]
+    if steady is not None:
+        result |= _steady_json(view, steady)
     return result
+
+
+def _steady_json(view: PredictionView, steady: np.ndarray) -> dict[str, Any]:
+    """Return the steady state of every row, or of a cycle its mean, and how sure it is."""
+    found: dict[str, Any] = {"steady": steady.tolist()}
+    limits = view.limits
+    if view.prediction.steady_bound is not None:
+        worst = view.prediction.steady_bound.max(axis=1)
+        found["steady_relative_bound"] = [float(b) if np.isfinite(b) else None for b in worst]
+    errors = view.steady_error()
+    if errors is not None:
+        found["steady_standard_error"] = errors.tolist()
+    found["steady_nature"] = [limit.prediction.nature for limit in limits for _ in limit.prediction.link]
+    if any(limit.period > 1 for limit in limits) and view.baseline is None:
+        found["steady_cycle"] = [row.tolist() for limit in limits for row in limit.values(view.metric, view.agent)]
+    return found
 
 
 STYLES = ("-", "--", ":", "-.")
@@ -405,6 +446,9 @@ def side_table(views: Sequence[PredictionView]) -> Table:
                 for value, error, end in zip(values, errors, ends, strict=True)
             ]
             rows.append((*names.cells(i), str(views[0].steps[k]), *cells))
+        steady = [view.steady_cells for view in views]
+        if any(steady):
+            rows.append((*names.cells(i), "steady", *("" if found is None else found[i] for found in steady)))
     keys = (*names.keys, "k")
     how = dict.fromkeys(view.how for view in views)
     titles = (*(view.what for view in views), views[0].whom, *how)
@@ -420,7 +464,7 @@ def side_csv(views: Sequence[PredictionView]) -> str:
 def side_json(views: Sequence[PredictionView]) -> dict[str, Any]:
     """Return the object of the first quantity, with all of them under `quantities`."""
     each = {view.prediction.quantity: predict_json(view) for view in views}
-    kept = ("values", "standard_error", "interval", "low", "high", "level", "bernstein")
+    kept = ("values", "standard_error", "interval", "low", "high", "level", "bernstein", *STEADY)
     return {
         **each[views[0].prediction.quantity],
         "quantities": {

@@ -224,6 +224,9 @@ RULES = (
     ),
 )
 """The table: what is not here is taken."""
+ENDING = ("links-per-step", "matrices-per-step")
+ENDLESS = "a model, sensors and links that do not vary with the step, or sensors with a period"
+"""Features that have no steady state, but that of sensors with periods, and what is expected in their place."""
 
 
 def pairs() -> list[tuple[str, str]]:
@@ -287,6 +290,28 @@ def require(system: System, links: LinkRows, estimator: str, engine: str) -> Non
             if has[name](system, links):
                 instead = "" if rule.beside else f"; {_instead(estimator, name)}"
                 raise UsageError(f"{rule.who.format(estimator=estimator)}: {rule.why}{instead}")
+
+
+def takes(system: System, links: LinkRows, estimator: str, engine: str) -> bool:
+    """Whether an estimator averaged by an engine takes what a system has."""
+    try:
+        require(system, links, estimator, engine)
+    except UsageError:
+        return False
+    return True
+
+
+def require_endless(system: System, links: LinkRows, *, periodic: bool) -> None:
+    """Raise UsageError if what is given ends with its steps, so that there is no steady state to ask for.
+
+    Parameters
+    ----------
+    periodic : whether what varies does so with a period, as far as that can be told.
+    """
+    goes_on = ("matrices-per-step",) if periodic else ()
+    for feature in FEATURES:
+        if feature.name in ENDING and feature.name not in goes_on and feature.has(system, links):
+            raise UsageError(f"a steady state needs {ENDLESS}; got {feature.key}")
 
 
 LATE, GAPS, BY_NAME = "messages that came late", "measurements that are missing", "sensors by name"

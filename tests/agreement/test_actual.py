@@ -218,7 +218,5 @@ def test_what_cannot_be_asked():
         sf.UsageError, match="quantity: expected one of claimed, actual, optimal, consistency, bias, rms, got 'x'"
     ):
         sf.predict(scenario, [0.5], quantity="x")
-    with pytest.raises(sf.UsageError, match="steady: expected quantity claimed, got rms"):
-        sf.predict(scenario, [0.5], quantity="rms", steady=True)
     notes = sf.predict(sf.load_scenario("thesis-steady", steps=2), [0.5], "general", "rms").notes
     assert any("the scenario has no known initial error (initial.error): the bias is 0" in note for note in notes)

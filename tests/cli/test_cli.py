@@ -95,6 +95,22 @@ def test_any_terminal_width(columns):
         assert f"{value:#.5g}" in headings
 
 
+def test_a_steady_state_beside_what_is_exact():
+    asked = ("predict", "--estimator", "naive", "--steps", "1", "--link", "0,0.5", "--runs", "30", "--steady")
+    rows = list(csv.DictReader(io.StringIO(run(*asked, "-f", "csv").stdout)))
+    assert [(row["step"], row["nature"]) for row in rows] == [("1", "exact"), ("steady", "sampled")] * 2
+    assert [row["standard_error"] == "" for row in rows] == [True, False] * 2
+    done = run(*asked, "--quantity", "claimed,optimal", "-f", "json")
+    found = strict_json(done.stdout)["quantities"]
+    assert found["claimed"]["steady"] == [float(row["value"]) for row in rows[1::2]]
+    assert found["claimed"]["steady_standard_error"] == [float(row["standard_error"]) for row in rows[1::2]]
+    assert found["optimal"]["steady_nature"] == ["exact"] * 2
+    assert max(found["optimal"]["steady_relative_bound"]) < 1e-9
+    assert "note: steady state: sampled at step" in done.stderr
+    table = run(*asked, "--quantity", "claimed,optimal").stdout
+    assert re.search(r"0\.5 +steady +\S+ ±\S+ +24\.897", table)
+
+
 def test_csv_markdown_and_latex():
     rows = list(
         csv.DictReader(
@@ -580,7 +596,7 @@ def test_an_input_is_never_overwritten(tmp_path):
         (["compare", "--methods", "general,naive", "--seed", "5"], "--seed: expected method monte-carlo, got general, naive"),
         (["crosscheck", "nowhere.csv", "--method", "simplified", "--max-graphs", "5"], "--max-graphs: expected method general or naive, got simplified"),
         (["compare", "fcs-demo"], "general cannot be compared here, leave it out of the methods"),
-        (["predict", "--steady", "--method", "general"], "steady: expected method simplified, got general"),
+        (["predict", "road-5", "--steady"], "a steady state needs a model, sensors and links that do not vary with the step"),
         (["predict", "--statistic", "std"], "--statistic std: expected --method general or naive, got simplified"),
         (["predict", "--method", "general", "--statistic", "mode"], "statistic: expected mean, variance, std, quantile:P"),
         (["predict", "--method", "general", "--statistic", "quantile:2"], "statistic: expected mean, variance, std, quantile:P"),

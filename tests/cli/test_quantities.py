@@ -135,7 +135,6 @@ def test_bad_bursts(tmp_path):
         (["--quantity", "truth"], "--quantity: expected one or several of claimed, actual, optimal, consistency, bias, rms, got 'truth'"),
         (["--quantity", "claimed,claimed"], "--quantity: expected different ones, got claimed,claimed"),
         (["--quantity", "rms", "--metric", "det"], "quantity rms: expected metric trace, max-eig, var:STATE, std:STATE"),
-        (["--quantity", "actual", "--steady"], "steady: expected quantity claimed, got actual"),
         (
             ["--quantity", "rms", "--method", "general", "--steps", "2", "--statistic", "derivative"],
             "derivative: expected metric trace or var:STATE of quantity claimed or actual, or the bias of one state",

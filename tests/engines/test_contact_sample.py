@@ -196,15 +196,16 @@ def test_links_that_never_and_always_deliver():
 
 
 def unlike(agents, steps=3, **network):
+    """No two agents alike, and everybody hears everybody: 2^n sets."""
     source = case(SCALAR, {"agents": agents, "steps": steps, "link": 0.2, **network}, error=[1.0])
-    return sf.Scenario.from_mapping(source | {"agent": [{"R": 1.0}] + [{}] * (agents - 1)})
+    return sf.Scenario.from_mapping(source | {"agent": [{"R": 1.0 + i} for i in range(agents)]})
 
 
 def test_beyond_the_chain_the_optimum_is_sampled():
     scenario = unlike(13)
     p = sf.predict(scenario, method="optimal", runs=200, seed=4)
     assert (p.nature, p.method, p.estimator) == ("sampled", "optimal", "optimal")
-    assert p.notes == ("more than 12 unlike agents or links: sampled, 200 runs; ± standard error",)
+    assert p.notes == ("the contact chain has more than 4096 states: sampled, 200 runs; ± standard error",)
     drawn = sf.predict(scenario, method="monte-carlo", estimator="optimal", runs=200, seed=4, quantity="rms")
     np.testing.assert_allclose(p.values(), drawn.shown_as("claimed").values(), rtol=1e-12)
     np.testing.assert_allclose(p.standard_error(), drawn.shown_as("actual").standard_error(), rtol=1e-9)
@@ -225,7 +226,7 @@ def test_like_agents_beyond_sixty_against_the_chain():
 
 def test_what_a_sample_is_refused():
     with pytest.raises(sf.UsageError, match="takes at most 1000 agents, got 1001"):
-        sf.predict(unlike(1001, 1, architecture="cyclic"), method="optimal")
+        sf.predict(sf.load_scenario(agents=1001, steps=1), method="monte-carlo", estimator="optimal")
     with pytest.raises(
         sf.UsageError, match=r"9000000 runs for 1 .* are 3.51e\+08 entries of covariances; expected at most"
     ):
