@@ -434,7 +434,7 @@ def noise_factor(R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def solve_lower(C: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """C⁻¹B for lower triangles C (p, p, items) and B (p, columns, items), by forward substitution; either may have one item for all."""
+    """C⁻¹B for lower triangles C (p, p, items) and B (p, columns, items), of which either may have one item for all."""
     out = np.empty((*B.shape[:2], max(B.shape[-1], C.shape[-1])))
     for i in range(len(out)):
         out[i] = B[i]

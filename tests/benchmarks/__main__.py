@@ -16,7 +16,7 @@ from rich.table import Table
 
 import stochfuse as sf
 from tests.agreement.test_accuracy import CASES
-from tests.benchmarks import chain, growth, intersection, literal, studies
+from tests.benchmarks import chain, growth, intersection, kernel, literal, studies
 from tests.oracles import textbook
 from tests.oracles.strategies import mapping
 
@@ -155,6 +155,10 @@ def main() -> None:
     )
     rows = [many_agents("thesis-transient", rounds), many_agents("cv-2d", rounds)]
     show("Cost against the number of agents, 1001 µ × 5 steps", ("work", "few", "many", "ratio", "bound", ""), rows)
+    if quick:  # at full length it wants one thread: python -m tests.benchmarks.kernel
+        title, rows = kernel.at_the_limit(own=False, quick=True)
+        show(title, ("way", "time", "over stochfuse's"), rows)
+        print("".join(f"{name} is not installed and was left out\n" for name in kernel.absent()))
     show(
         "Covariance intersection of 4×4 pairs, in one run; error in ω against the root of the derivative",
         intersection.HEADINGS,

@@ -2,18 +2,29 @@
 
 `python -m tests.benchmarks.kernel [--quick]`.  Every way gets the noises in the layout that suits it, goes through five
 steps of predict and update, and returns the last covariances; answers must agree with the literal stacks.  JAX and Numba
-(extra `bench`) compile before they are timed; one that is not installed is named and left out.
+(extra `bench`) compile before they are timed; one that is not installed is named and left out.  Times are CPU time, the
+ways in turns, so that other work on the machine hits all alike; the lower quartile is shown.
 """
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
+import os
+import sys
+import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
+import stochfuse as sf
+from tests.oracles import textbook
+
 STEPS = 5
+OURS, MANY = "stochfuse, kalman.covariances", "stochfuse, predict_many (checked, every step)"
+HEADINGS = ("work", *("stacks", "arrays", "stochfuse"), "over stacks", "over arrays")
+SIZES = ((1, 1), (2, 1), (2, 2), (4, 1), (4, 2), (4, 4), (6, 2), (6, 6), (9, 3), (9, 6), (15, 3), (15, 6))
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 Run = Callable[[], np.ndarray]
 
@@ -210,4 +221,107 @@ def numba_ways(given: Work) -> dict[str, Run]:
             out[n] = P
         return out
 
-    return {"Numba": lambda: loop(F, H, Q, R, P0, np.empty_like(P0))}
+    @numba.njit
+    def plain(F, H, Q, R, P0, out):
+        for n in range(len(P0)):
+            f, h, P = F[n if own else 0], H[n if own else 0], P0[n]
+            for _ in range(steps):
+                prior = f @ P @ f.T + Q[n]
+                HP = h @ prior
+                P = prior - HP.T @ np.linalg.solve(HP @ h.T + R[n], HP)
+            out[n] = P
+        return out
+
+    return {
+        "Numba, matrix by matrix": lambda: plain(F, H, Q, R, P0, np.empty_like(P0)),
+        "Numba, written out": lambda: loop(F, H, Q, R, P0, np.empty_like(P0)),
+    }
+
+
+def ours(given: Work) -> dict[str, Run]:
+    """The kernel; and, where filters share F and H, the batch of scenarios of one agent, with its checks."""
+    F, H, Q, R, P0 = given
+    ways: dict[str, Run] = {OURS: lambda: sf.kalman.covariances(P0, F, Q, H, R, STEPS)}
+    if not given.own:
+        model = {"F": F.tolist(), "H": H.tolist(), "Q": Q[0].tolist(), "R": R[0].tolist()}
+        network = {"agents": 1, "steps": STEPS + 1, "link": 0.0}  # step 1 is the exchange of first estimates
+        scenario = sf.scenario(model=model, initial=P0[0].tolist(), network=network)
+        ways[MANY] = lambda: sf.predict_many(scenario, Q=Q, R=R, P=P0).moments.P[:, -1, 0]
+    return ways
+
+
+def measured(ways: dict[str, Run], units: int, rounds: int) -> dict[str, float]:
+    """CPU nanoseconds of a unit, after the answers were compared."""
+    expected = ways["NumPy, stacks"]()
+    for name, run in ways.items():
+        found = textbook.scaled_error(np.asarray(run()), expected)
+        if not found < 1e-9:
+            raise SystemExit(f"kernel: {name}: expected agreement to 1e-9, got a difference of {found:.3g}")
+    times: dict[str, list[float]] = {name: [] for name in ways}
+    for _ in range(rounds):
+        for name, run in ways.items():
+            start = time.process_time()
+            run()
+            times[name].append(time.process_time() - start)
+    return {name: float(np.quantile(each, 0.25)) / units * 1e9 for name, each in times.items()}
+
+
+def at_the_limit(own: bool, quick: bool) -> tuple[str, list[tuple[str, ...]]]:
+    """Four states, two measured: every way, the time of a filter's step, and over the kernel's."""
+    items, rounds = (500, 1) if quick else (10_000, 60)
+    given = work(items, 4, 2, own)
+    ways = {"NumPy, stacks": stacks(given), "NumPy, struct of arrays": arrays(given)}
+    found = measured(ways | jax_ways(given) | numba_ways(given) | ours(given), items * STEPS, rounds)
+    models = "F and H of each filter's own" if own else "common F and H"
+    title = (
+        f"{items:,} filters of 4 states, 2 measured, {STEPS} steps, own Q, R, P; {models}; CPU time of a filter-step"
+    )
+    return title, [(name, f"{ns:.0f} ns", f"{ns / found[OURS]:.2f}") for name, ns in found.items()]
+
+
+def sizes(quick: bool) -> list[tuple[str, ...]]:
+    """Stacks and struct of arrays against the kernel, over states, measurements and filters."""
+    rows = []
+    for d, p in SIZES[:2] if quick else SIZES:
+        for items in (100,) if quick else (100, 1000, 10_000, 100_000, 1_000_000):
+            if items * d * d > 20_000_000:  # Q, R and P of a million filters of 15 states are 4 GB
+                continue
+            given = work(items, d, p)
+            ways = {"NumPy, stacks": stacks(given), "NumPy, struct of arrays": arrays(given), OURS: ours(given)[OURS]}
+            found = list(measured(ways, items * STEPS, 1 if quick else int(np.clip(300_000 / items, 3, 60))).values())
+            name = f"{d} states, {p} measured, {items:,} filters"
+            ratios = (f"{found[2] / found[0]:.2f}", f"{found[2] / found[1]:.2f}")
+            rows.append((name, *(f"{ns:.3g} ns" for ns in found), *ratios))
+    return rows
+
+
+def absent() -> list[str]:
+    """Which compilers are not installed."""
+    return [name for name in ("jax", "numba") if importlib.util.find_spec(name) is None]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.kernel", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="few filters, one round: only that it runs and agrees")
+    quick = parser.parse_args().quick
+    from tests.benchmarks.__main__ import show
+
+    for own in (False, True):
+        title, rows = at_the_limit(own, quick)
+        show(title, ("way", "time", "over stochfuse's"), rows)
+    show("Over sizes, common F and H; CPU time of a filter-step", HEADINGS, sizes(quick))
+    for name in absent():
+        print(
+            f"kernel: {name} is not installed and was left out; it comes with: pip install '.[bench]'", file=sys.stderr
+        )
+
+
+if __name__ == "__main__":
+    if os.environ.get("OMP_NUM_THREADS") != "1":  # libraries read it when they are loaded: begin again
+        flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+        os.execve(
+            sys.executable,
+            [sys.executable, "-m", "tests.benchmarks.kernel", *sys.argv[1:]],
+            {**os.environ, **dict.fromkeys(THREADS, "1"), "XLA_FLAGS": flags},
+        )
+    main()
