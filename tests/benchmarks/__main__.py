@@ -26,16 +26,18 @@ LINKS = {"'gps-ins'": [round(0.1 * i, 1) for i in range(11)]}
 """Link probabilities of the cases that are not measured at 0.5."""
 
 
-def medians(*functions: Callable[[], object], rounds: int) -> list[float]:
+def medians(
+    *functions: Callable[[], object], rounds: int, clock: Callable[[], float] = time.perf_counter
+) -> list[float]:
     """Median seconds of each function, measured in turns, so that drift of the machine hits all alike."""
     times: list[list[float]] = [[] for _ in functions]
     for function in functions:
         function()
     for _ in range(rounds):
         for function, record in zip(functions, times, strict=True):
-            start = time.perf_counter()
+            start = clock()
             function()
-            record.append(time.perf_counter() - start)
+            record.append(clock() - start)
     return [statistics.median(record) for record in times]
 
 
