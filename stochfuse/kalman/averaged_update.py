@@ -20,7 +20,7 @@ from __future__ import annotations
 import numpy as np
 
 from stochfuse.kalman.arrivals import Arrivals
-from stochfuse.kalman.packed import triangle
+from stochfuse.kalman.packed import subtract, triangle
 
 _TINY = 1e-300
 
@@ -60,16 +60,8 @@ def update_measurement_space(
     left = 1.0 - (s * g).max(axis=0)
     if squares is not None:
         g *= squares
-    P = prior  # overwritten: the caller made it for this step
-    product, first = np.empty((d, P.shape[1])), 0
-    for i in range(d):
-        # row i of the upper triangle: entries (i, i) … (i, d−1) lie side by side
-        row, some = P[first : first + d - i], product[: d - i]
-        for j in range(p):
-            np.multiply(g[j] * W[j, i], W[j, i:], out=some)
-            row -= some
-        first += d - i
-    return P, left
+    subtract(prior, g[:, None] * W, W, np.empty_like(prior), prior)  # overwritten: the caller made it for this step
+    return prior, left
 
 
 def _diagonalise(

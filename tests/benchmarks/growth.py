@@ -1,8 +1,8 @@
 """How cost grows: seconds, slopes and figures; and, as a command, every method against everything that can grow.
 
-`python -m tests.benchmarks.growth [--quick] [--markdown] [--largest] [--workers] [--only WORD]`.  Times are CPU seconds of one
+`python -m tests.benchmarks.growth [--quick] [--markdown] [--longest SECONDS] [--largest] [--workers] [--only WORD]`.  Times are CPU seconds of one
 thread, memory is the peak of what Python and NumPy hold.  Exponents are slopes of the upper half in doubly logarithmic axes,
-beside what theory says; a series ends where a point takes longer than `LONGEST`.  `--largest` doubles a scenario until it
+beside what theory says; a series ends where the next point would take longer than `--longest`.  `--largest` doubles a scenario until it
 takes more than 60 s or 4 GB, each in a process of its own; `--workers` asks what a second worker is worth.
 """
 
@@ -65,7 +65,7 @@ def draw(panels: dict[str, Growth], output: Path, sizes: str, cost: str) -> None
 
 
 LONGEST = 4.0
-"""Seconds that a point of a series may take."""
+"""Seconds that a point of a series may take, if it is not said otherwise."""
 SECONDS, BYTES = 60.0, 4e9
 """What the largest scenario may take."""
 
@@ -178,13 +178,13 @@ def named(asked: Asked, but: str) -> str:
     return f"{asked.estimator or asked.method}{', sampled' if asked.runs else ''}: {', '.join(size)}"
 
 
-def cost(asked: Asked) -> tuple[float, float]:
+def cost(asked: Asked, longest: float) -> tuple[float, float]:
     """CPU seconds, the least of some runs after a first one, and peak bytes."""
     work = asked.work()
     start = time.process_time()
     work()
     took = [time.process_time() - start]
-    while sum(took) < LONGEST / 8 and len(took) < 5:
+    while sum(took) < longest / 8 and len(took) < 5:
         start = time.process_time()
         work()
         took.append(time.process_time() - start)
@@ -195,15 +195,16 @@ def cost(asked: Asked) -> tuple[float, float]:
     return min(took), peak
 
 
-def grown(series: Series, quick: bool) -> tuple[str, ...]:
+def grown(series: Series, longest: float, quick: bool) -> tuple[str, ...]:
     """A row: what was asked, what grew from where to where, time, exponents, theory."""
     sizes, times, peaks = [], [], []
     for size in series.sizes[:2] if quick else series.sizes:
-        seconds_of, peak = cost(series.asked._replace(**{series.key: size}))
+        seconds_of, peak = cost(series.asked._replace(**{series.key: size}), longest)
         sizes.append(size)
         times.append(seconds_of)
         peaks.append(peak)
-        if seconds_of * size / sizes[max(len(sizes) - 2, 0)] > LONGEST:
+        # the next point takes as much more as this one took
+        if seconds_of * (seconds_of / times[-2] if len(times) > 1 else 1.0) > longest:
             break
     half = slice((len(sizes) - 1) // 2, None) if len(sizes) > 2 else slice(None)
     slope = [
@@ -310,6 +311,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.growth", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="two sizes each: only that it runs")
     parser.add_argument("--markdown", action="store_true", help="print tables for the handbook")
+    parser.add_argument("--longest", type=float, default=LONGEST, metavar="SECONDS", help="of a point of a series")
     parser.add_argument("--largest", action="store_true", help="the largest scenario of each method in 60 s and 4 GB")
     parser.add_argument("--workers", action="store_true", help="what a second worker is worth; wants a quiet machine")
     parser.add_argument("--only", default="", metavar="WORD", help="only work with this word in its name")
@@ -330,7 +332,7 @@ def main() -> None:
         for series in ALL:
             if given.only in named(series.asked, series.key):
                 print(f"{len(rows) + 1}: {named(series.asked, series.key)}, {series.key}", file=sys.stderr)
-                rows.append(grown(series, given.quick))
+                rows.append(grown(series, given.longest, given.quick))
     if given.markdown:
         print(as_markdown(headings, rows))
     else:

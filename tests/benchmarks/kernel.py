@@ -1,6 +1,6 @@
 """Covariance recursions of many filters with noises of their own, against what others write for one thread.
 
-`python -m tests.benchmarks.kernel [--quick]`.  Every way gets the noises in the layout that suits it, goes through five
+`python -m tests.benchmarks.kernel [--quick] [--most FILTERS]`.  Every way gets the noises in the layout that suits it, goes through five
 steps of predict and update, and returns the last covariances; answers must agree with the literal stacks.  JAX and Numba
 (extra `bench`) compile before they are timed; one that is not installed is named and left out.  Times are CPU time, the
 ways in turns, so that other work on the machine hits all alike; the lower quartile is shown.
@@ -279,12 +279,12 @@ def at_the_limit(own: bool, quick: bool) -> tuple[str, list[tuple[str, ...]]]:
     return title, [(name, f"{ns:.0f} ns", f"{ns / found[OURS]:.2f}") for name, ns in found.items()]
 
 
-def sizes(quick: bool) -> list[tuple[str, ...]]:
+def sizes(quick: bool, most: int) -> list[tuple[str, ...]]:
     """Stacks and struct of arrays against the kernel, over states, measurements and filters."""
     rows = []
     for d, p in SIZES[:2] if quick else SIZES:
         for items in (100,) if quick else (100, 1000, 10_000, 100_000, 1_000_000):
-            if items * d * d > 20_000_000:  # Q, R and P of a million filters of 15 states are 4 GB
+            if items > most or items * d * d > 20_000_000:  # Q, R and P of a million filters of 15 states are 4 GB
                 continue
             given = work(items, d, p)
             ways = {"NumPy, stacks": stacks(given), "NumPy, struct of arrays": arrays(given), OURS: ours(given)[OURS]}
@@ -303,13 +303,15 @@ def absent() -> list[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.kernel", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="few filters, one round: only that it runs and agrees")
-    quick = parser.parse_args().quick
+    parser.add_argument("--most", type=int, default=1_000_000, help="filters, of the table over sizes")
+    given = parser.parse_args()
+    quick = given.quick
     from tests.benchmarks.__main__ import show
 
     for own in (False, True):
         title, rows = at_the_limit(own, quick)
         show(title, ("way", "time", "over stochfuse's"), rows)
-    show("Over sizes, common F and H; CPU time of a filter-step", HEADINGS, sizes(quick))
+    show("Over sizes, common F and H; CPU time of a filter-step", HEADINGS, sizes(quick, given.most))
     for name in absent():
         print(
             f"kernel: {name} is not installed and was left out; it comes with: pip install '.[bench]'", file=sys.stderr
