@@ -409,16 +409,15 @@ def run_like(case: Case, steps: int) -> Like:
         if steps > 1 and all(nobody_else(a) for a in case.arrivals[1:steps]):
             again = np.flatnonzero(~(_run_alone(case, covariances, unsound) > CANCELLATION) | unsound)
         for form in (MeasurementSpace, SquareRoot):
-            left = np.ones(len(again))
+            left, whole = np.ones(len(again)), len(again) == case.items
             for first in range(0, len(again), BLOCK):
                 block = np.s_[first : first + BLOCK]
-                some = again[block]
-                part = case if len(some) == case.items else case.take(some)
-                redone = covariances if len(some) == case.items else np.empty((steps, d, d, len(some)))
-                carried = run(form(part), steps, redone)
-                left[block] = carried.left
+                some = block if whole else again[block]
+                part = case if whole and case.items <= BLOCK else case.take(some)
+                redone = covariances[..., some] if whole else np.empty((steps, d, d, part.items))
+                left[block] = run(form(part), steps, redone).left
                 unsound[some] = ~sound(redone[-1][triangle(d)[:2]], d)
-                if redone is not covariances:
+                if not whole:
                     covariances[..., some] = redone
             lost = ~(left > CANCELLATION) | ~np.isfinite(covariances[-1][..., again]).all(axis=(0, 1))
             again = again[lost]
