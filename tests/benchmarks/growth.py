@@ -302,9 +302,9 @@ def second_worker(quick: bool) -> list[tuple[str, ...]]:
     return rows
 
 
-def as_markdown(headings: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    """Return a table for the handbook."""
-    return "\n".join("| " + " | ".join(row) + " |" for row in (headings, ("---",) * len(headings), *rows))
+def as_markdown(rows: list[tuple[str, ...]]) -> str:
+    """Return rows of a table for the handbook."""
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
 
 def main() -> None:
@@ -331,10 +331,10 @@ def main() -> None:
         rows = []
         for series in ALL:
             if given.only in named(series.asked, series.key):
-                print(f"{len(rows) + 1}: {named(series.asked, series.key)}, {series.key}", file=sys.stderr)
                 rows.append(grown(series, given.longest, given.quick))
+                print(as_markdown(rows[-1:]), file=sys.stderr, flush=True)  # who ends it early has what there is
     if given.markdown:
-        print(as_markdown(headings, rows))
+        print(as_markdown([headings, ("---",) * len(headings), *rows]))
     else:
         from tests.benchmarks.__main__ import show
 
