@@ -16,6 +16,7 @@ from stochfuse.scenario.schema import ScenarioFile
 HANDBOOK = Path(__file__).parents[1] / "notebooks" / "handbook"
 CHAPTERS = {
     "The Kalman filter": "kalman.kernel",
+    "Many filters at once": "kalman.packed",
     "The simplified formulation": "prediction.simplified",
     "The average over arrivals": "kalman.averaged_update",
     "The Local Fusion Graph": "estimators.local_fusion_graph",

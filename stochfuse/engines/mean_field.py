@@ -20,17 +20,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from stochfuse.engines.progress import listener
-from stochfuse.kalman.arrivals import Arrivals
-from stochfuse.kalman.averaged_update import (
-    noise_factor,
-    prior_map,
-    smallest_pivot,
-    solve_lower,
-    triangle,
-    update_measurement_space,
-    update_scalar,
-    upper,
-)
+from stochfuse.kalman.arrivals import Arrivals, nobody_else
+from stochfuse.kalman.averaged_update import update_measurement_space, update_scalar
 from stochfuse.kalman.kernel import (
     AsTheyAre,
     Information,
@@ -43,11 +34,21 @@ from stochfuse.kalman.kernel import (
     update_factor,
     update_information,
 )
+from stochfuse.kalman.packed import (
+    CANCELLATION,
+    Step,
+    carry,
+    noise_factor,
+    prior_map,
+    smallest_pivot,
+    solve_lower,
+    sound,
+    triangle,
+    unpack,
+    upper,
+)
 from stochfuse.scenario.model import Model, Sensor, varies
 from stochfuse.scenario.system import Noises
-
-CANCELLATION = 1e-5
-"""Share of prior variance left by an update, below which the square-root form takes over: 1e-16/1e-5 of an entry."""
 
 BLOCK = 4096
 """Items that are carried through all steps together: what a core's cache holds for a few states."""
@@ -178,7 +179,10 @@ class MeasurementSpace:
         return Carried(P, left, peak)
 
     def covariance(self, carried: Carried, out: np.ndarray | None = None) -> np.ndarray:
-        return np.take(carried.value, triangle(self.case.model.dimension)[2], axis=0, out=out, mode="clip")
+        d = self.case.model.dimension
+        out = np.empty((d, d, carried.value.shape[1])) if out is None else out
+        unpack(carried.value, d, out)
+        return out
 
     def carry(self, P: np.ndarray) -> Carried:
         return Carried(upper(P), np.ones(len(P)) if self._own is None else self._own.left)
@@ -362,17 +366,12 @@ def _from_factors(L: np.ndarray, out: np.ndarray | None) -> np.ndarray:
     return out
 
 
-def run(form: Form, steps: int, out: np.ndarray) -> np.ndarray:
-    """Carry a form through the steps.
+def run(form: Form, steps: int, out: np.ndarray) -> Carried:
+    """Carry a form through the steps, and return its last state.
 
     Parameters
     ----------
     out : (steps, d, d, items), filled with the averaged posterior covariances.
-
-    Returns
-    -------
-    ndarray
-        (items,) smallest share of prior variance that any update left.
     """
     carried, progress = form.start(), listener()
     form.covariance(carried, out[0])
@@ -380,30 +379,69 @@ def run(form: Form, steps: int, out: np.ndarray) -> np.ndarray:
         carried = form.advance(carried, step)
         form.covariance(carried, out[step - 1])
         progress.advance("step", step, steps)
-    return carried.left
+    return carried
 
 
-def run_like(case: Case, steps: int, out: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+class Like(NamedTuple):
+    """What was found of like agents.
+
+    Parameters
+    ----------
+    covariance : (steps, d, d, items); not finite where it grows beyond floating point.
+    cancelled : (items,) whether the square-root form was needed.
+    unsound : (items,) where a covariance may be none; all others have been looked at.
+    """
+
+    covariance: np.ndarray
+    cancelled: np.ndarray
+    unsound: np.ndarray
+
+
+def run_like(case: Case, steps: int) -> Like:
     """Run like agents in measurement space, and again in square-root form where that cancels.
 
-    Returns
-    -------
-    covariance : (steps, d, d, items), `out` if that is given; not finite where it grows beyond floating point.
-    cancelled : (items,) whether the square-root form was needed.
+    An agent that hears nobody averages over nothing: its filter is carried by itself.
     """
     d = case.model.dimension
-    covariances = np.empty((steps, d, d, case.items)) if out is None else out
-    left = np.empty(case.items)
+    covariances = np.empty((steps, d, d, case.items))
+    again, unsound, cancelled = np.arange(case.items), *np.zeros((2, case.items), dtype=bool)
     with np.errstate(all="ignore"):
-        for first in range(0, case.items, BLOCK):
-            block = np.s_[first : first + BLOCK]
-            part = case if case.items <= BLOCK else case.take(block)
-            left[block] = run(MeasurementSpace(part), steps, covariances[..., block])
-        cancelled = ~(left > CANCELLATION) | ~np.isfinite(covariances[-1]).all(axis=(0, 1))
-        again = np.flatnonzero(cancelled)
-        for first in range(0, len(again), BLOCK):
-            some = again[first : first + BLOCK]
-            redone = np.empty((steps, d, d, len(some)))
-            run(SquareRoot(case.take(some)), steps, redone)
-            covariances[..., some] = redone
-    return covariances, cancelled
+        if steps > 1 and all(nobody_else(a) for a in case.arrivals[1:steps]):
+            again = np.flatnonzero(~(_run_alone(case, covariances, unsound) > CANCELLATION) | unsound)
+        for form in (MeasurementSpace, SquareRoot):
+            left, whole = np.ones(len(again)), len(again) == case.items
+            for first in range(0, len(again), BLOCK):
+                block = np.s_[first : first + BLOCK]
+                some = block if whole else again[block]
+                part = case if whole and case.items <= BLOCK else case.take(some)
+                redone = covariances[..., some] if whole else np.empty((steps, d, d, part.items))
+                left[block] = run(form(part), steps, redone).left
+                unsound[some] = ~sound(redone[-1][triangle(d)[:2]], d)
+                if not whole:
+                    covariances[..., some] = redone
+            lost = ~(left > CANCELLATION) | ~np.isfinite(covariances[-1][..., again]).all(axis=(0, 1))
+            again = again[lost]
+            if form is MeasurementSpace:
+                cancelled[again] = True
+        for variances in np.diagonal(covariances, axis1=1, axis2=2).transpose(2, 0, 1):
+            if not variances.min(initial=0.0) >= 0:
+                unsound |= ~(variances >= 0).all(axis=0)
+    return Like(covariances, cancelled, unsound)
+
+
+def _run_alone(case: Case, out: np.ndarray, unsound: np.ndarray) -> np.ndarray:
+    """Carry filters that hear nobody through all steps; return the share of variance that is left at least."""
+    model, sensor, (Q, R, P0), steps = case.model, case.sensor, case.noises, len(out)
+    P0 = case.P0 if P0 is None else P0
+
+    def at(step: int) -> Step:
+        F, H = at_step(model.F, step), at_step(sensor.H, step)
+        return Step(F, at_step(model.Q, step) if Q is None else Q, H, at_step(sensor.R, step) if R is None else R)
+
+    varying = model.varies or sensor.varies
+    through = [at(step) for step in range(2, steps + 1)] if varying else [at(2)] * (steps - 1)
+    share, progress = case.first_share(), listener()
+    out[0] = np.moveaxis(P0, 0, -1) if P0.ndim == 3 else P0[..., None]
+    if not (share == 1.0).all():
+        out[0] *= share
+    return carry(P0, through, out[1:], share, unsound, lambda k: progress.advance("step", k + 1, steps))

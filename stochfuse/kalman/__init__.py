@@ -1,15 +1,16 @@
 """The ground: the Kalman filter's equations, once for numbers and symbols, and covariances as numbers.
 
-Doors: `kernel` (predict, update, in covariance, information and square-root form; the only copy) and `metrics` (one
-number out of a covariance, moments of an error).  `averaged_update` and `arrivals` average the update over a number
-of arriving measurements, (54); `algebra` is what differs between NumPy and SymPy; `checks` says why a matrix is no
-covariance.
+Doors: `kernel` (predict, update, in covariance, information and square-root form; the only copy), `packed` (its
+covariances of many filters side by side, at speed) and `metrics` (one number out of a covariance, moments of an error).
+`averaged_update` and `arrivals` average the update over a number of arriving measurements, (54); `algebra` is what
+differs between NumPy and SymPy; `checks` says why a matrix is no covariance.
 
 It knows nothing but NumPy: no scenario, no network, no chance but the number of arrivals.  A new form of predict or
 update goes into `kernel`, over the same `algebra`; a new metric into `metrics`, with its entry in
 `stochfuse.scenario.registry`.
 
-For arrays of one's own: `predict` and `update` here take means of shape (d,) or (d, 1), and batches in front.
+For arrays of one's own: `predict` and `update` here take means of shape (d,) or (d, 1), and batches in front;
+`covariances` carries many filters through steps.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ import numpy as np
 from stochfuse.errors import UsageError
 from stochfuse.kalman import kernel
 from stochfuse.kalman.kernel import Estimate
+from stochfuse.kalman.packed import covariances
 
-__all__ = ["Estimate", "predict", "update"]
+__all__ = ["Estimate", "covariances", "predict", "update"]
 
 
 def predict(estimate: Any, F: Any, Q: Any, Bu: Any = None) -> Estimate:

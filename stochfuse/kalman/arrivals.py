@@ -184,6 +184,11 @@ class Binomial:
         return total / rate
 
 
+def nobody_else(arrivals: Arrivals) -> bool:
+    """Whether the agent's own measurement, and none but that, is certain."""
+    return isinstance(arrivals, Counts) and len(arrivals.weights) == 1 and not np.any(arrivals.nothing)
+
+
 def like_senders(senders: int, link: np.ndarray, detection: float = 1.0) -> Arrivals:
     """Distribution of arrivals from N senders that are heard with the same probability, thesis (50).
 

@@ -42,8 +42,8 @@ from typing import NamedTuple
 import numpy as np
 
 from stochfuse.engines.mean_field import Case, UnlikeCase
-from stochfuse.kalman.averaged_update import basis, triangle
 from stochfuse.kalman.kernel import Estimate, at_step, corrected, gain, predict
+from stochfuse.kalman.packed import basis, triangle
 from stochfuse.scenario.model import Sensor
 
 ROUNDING = 1e-13

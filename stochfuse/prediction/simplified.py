@@ -41,10 +41,10 @@ from stochfuse.engines.precision import definite, ill_noise, lost, rounding, tol
 from stochfuse.errors import UsageError
 from stochfuse.kalman.algebra import NUMPY, Algebra, inverse
 from stochfuse.kalman.arrivals import Arrivals, Counts, like_senders, poisson_binomial
-from stochfuse.kalman.averaged_update import noise_factor, sound
 from stochfuse.kalman.checks import first_fault
 from stochfuse.kalman.kernel import Estimate, from_information, to_information, update, update_information
 from stochfuse.kalman.metrics import Moments
+from stochfuse.kalman.packed import noise_factor, sound, triangle
 from stochfuse.prediction.method import Averaged, Settings, joined
 from stochfuse.scenario.capabilities import require
 from stochfuse.scenario.network import LinkRows, number_of_senders, possible_senders
@@ -177,15 +177,15 @@ def covariances(system: System, items: Items) -> Covariances:
     for group in all_groups:
         if isinstance(group.case, Case):
             usable, singular = _factorable(group.case)
-            P, cancelled = run_like(usable, steps)
+            P, cancelled, unsound = run_like(usable, steps)
             forms |= forms_used(cancelled)
             needed_root |= cancelled.reshape(links, -1).any(axis=1)
         else:
-            singular, P = {}, np.empty((steps, *system.P0.shape, group.case.items))
+            singular, unsound, P = {}, None, np.empty((steps, *system.P0.shape, group.case.items))
             with np.errstate(all="ignore"):
                 run(group.case, steps, P)
             forms.add("outcomes")
-        for item, fault in sorted((faults(P) | singular).items()):
+        for item, fault in sorted((faults(P, unsound) | singular).items()):
             why.setdefault(item // group.columns, fault)
         d = P.shape[1]
         parts.append(P.reshape(steps, d, d, links, group.columns).transpose(3, 0, 4, 1, 2))
@@ -220,12 +220,19 @@ def forms_used(cancelled: np.ndarray) -> set[str]:
     return used | ({"measurement-space"} if not cancelled.all() else set())
 
 
-def faults(P: np.ndarray) -> dict[int, str]:
-    """Why covariances (steps, d, d, items) are none, per item where one is not: the first step and what is wrong."""
-    # what is not finite stays so; what an update takes too much of shows in a variance, or is there at the last step
-    fine = sound(P[-1]) & (np.diagonal(P, axis1=1, axis2=2) >= 0).all(axis=(0, 2))
+def faults(P: np.ndarray, suspects: np.ndarray | None = None) -> dict[int, str]:
+    """Why covariances (steps, d, d, items) are none, per item where one is not: the first step and what is wrong.
+
+    Parameters
+    ----------
+    suspects : (items,) which items to look at; default: those that a cheap check is not satisfied with.
+    """
+    if suspects is None:
+        # what is not finite stays so; what an update takes too much of shows in a variance, or at the last step
+        d = P.shape[1]
+        suspects = ~(sound(P[-1][triangle(d)[:2]], d) & (np.diagonal(P, axis1=1, axis2=2) >= 0).all(axis=(0, 2)))
     found: dict[int, str] = {}
-    for item in np.flatnonzero(~fine):
+    for item in np.flatnonzero(suspects):
         first = first_fault(P[..., item])
         if first is not None:
             step, fault = first

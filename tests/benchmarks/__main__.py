@@ -16,7 +16,7 @@ from rich.table import Table
 
 import stochfuse as sf
 from tests.agreement.test_accuracy import CASES
-from tests.benchmarks import chain, growth, intersection, literal, studies
+from tests.benchmarks import chain, growth, intersection, kernel, literal, studies
 from tests.oracles import textbook
 from tests.oracles.strategies import mapping
 
@@ -26,16 +26,18 @@ LINKS = {"'gps-ins'": [round(0.1 * i, 1) for i in range(11)]}
 """Link probabilities of the cases that are not measured at 0.5."""
 
 
-def medians(*functions: Callable[[], object], rounds: int) -> list[float]:
+def medians(
+    *functions: Callable[[], object], rounds: int, clock: Callable[[], float] = time.perf_counter
+) -> list[float]:
     """Median seconds of each function, measured in turns, so that drift of the machine hits all alike."""
     times: list[list[float]] = [[] for _ in functions]
     for function in functions:
         function()
     for _ in range(rounds):
         for function, record in zip(functions, times, strict=True):
-            start = time.perf_counter()
+            start = clock()
             function()
-            record.append(time.perf_counter() - start)
+            record.append(clock() - start)
     return [statistics.median(record) for record in times]
 
 
@@ -155,6 +157,10 @@ def main() -> None:
     )
     rows = [many_agents("thesis-transient", rounds), many_agents("cv-2d", rounds)]
     show("Cost against the number of agents, 1001 µ × 5 steps", ("work", "few", "many", "ratio", "bound", ""), rows)
+    if quick:  # at full length it wants one thread: python -m tests.benchmarks.kernel
+        title, rows = kernel.at_the_limit(own=False, quick=True)
+        show(title, ("way", "time", "over stochfuse's"), rows)
+        print("".join(f"{name} is not installed and was left out\n" for name in kernel.absent()))
     show(
         "Covariance intersection of 4×4 pairs, in one run; error in ω against the root of the derivative",
         intersection.HEADINGS,

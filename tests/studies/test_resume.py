@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -422,9 +423,9 @@ def test_workers_that_are_not_as_they_should_be(function, message, tmp_path):
         sf.study(FEW, tmp_path / "few.csv", executor=Handing(function, threads))  # type: ignore[arg-type]
 
 
-@pytest.fixture(scope="module")
-def cluster():
-    """Two workers, each a process, on the loopback."""
+@contextmanager
+def local_cluster(workers: int):
+    """Workers, each a process, on the loopback."""
     from dask import config
     from distributed import LocalCluster
 
@@ -435,7 +436,7 @@ def cluster():
     with (
         config.set(quiet_please),
         LocalCluster(
-            n_workers=2,
+            n_workers=workers,
             processes=True,
             threads_per_worker=1,
             host="127.0.0.1",
@@ -443,6 +444,12 @@ def cluster():
             silence_logs=50,
         ) as cluster,
     ):
+        yield cluster
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    with local_cluster(2) as cluster:
         yield cluster
 
 
@@ -454,13 +461,24 @@ def collected():
 
 
 def test_a_dask_cluster_of_two_workers_one_of_which_is_killed(cluster, tmp_path, quiet, collected):
+    assert with_one_killed(cluster, 2, tmp_path) == quiet["sampled", ".csv"][0]
+
+
+@pytest.mark.slow
+def test_a_dask_cluster_of_four_workers_one_of_which_is_killed(tmp_path, quiet, collected):
+    with local_cluster(4) as four:
+        assert with_one_killed(four, 4, tmp_path) == quiet["sampled", ".csv"][0]
+
+
+def with_one_killed(cluster, workers, tmp_path):
+    """What a study of sampled points writes on a cluster of which a worker is killed after the first chunk."""
     from distributed import Client
 
     study, output = tmp_path / "mine.toml", tmp_path / "mine.csv"
     study.write_text(SAMPLED)
     client: Any = Client(cluster)
     with client:
-        client.wait_for_workers(2, timeout=20)
+        client.wait_for_workers(workers, timeout=20)
         victim = sorted(client.run(os.getpid).values())[0]
         killed = []
 
@@ -470,10 +488,10 @@ def test_a_dask_cluster_of_two_workers_one_of_which_is_killed(cluster, tmp_path,
                     os.kill(victim, signal.SIGKILL)
                     killed.append(len(parts(output)))
 
-        sf.study(study, output, executor=client.get_executor(), workers=2, progress=KillsOne())
+        sf.study(study, output, executor=client.get_executor(), workers=workers, progress=KillsOne())
         assert killed == [1]
         assert not alive(victim)
-    assert content(output) == quiet["sampled", ".csv"][0]
+    return content(output)
 
 
 def test_the_command_works_on_a_dask_cluster(cluster, tmp_path, quiet, collected):

@@ -26,7 +26,7 @@ def sections(quick: bool) -> list[Section]:
         recursion.section("4 states, 2 measured", recursion.plane(items), few, rounds),
         fusion.section("det", items, few, 1 if quick else 3),
         fusion.section("trace", items, few, 1 if quick else 3),
-        network.section(quick, 1 if quick else 21),
+        network.section(quick, 1 if quick else 11),
     ]
 
 
@@ -41,7 +41,7 @@ def heading(busy: float) -> str:
     packages = ("stochfuse", "numpy", "scipy", "filterpy", "stonesoup", "simdkalman")
     versions = ", ".join(f"{name} {version(name)}" for name in packages)
     day = datetime.now(UTC).date()
-    where = f"{day}, {processor()}, one thread ({busy:.2f} CPU seconds a second), Python {platform.python_version()}"
+    where = f"{day}, {processor()}, CPU time of one thread ({busy:.2f} CPU seconds a second), Python {platform.python_version()}"
     return f"{where}, {versions}"
 
 
