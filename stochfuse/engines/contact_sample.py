@@ -32,9 +32,10 @@ import numpy as np
 
 from stochfuse.engines.contact_chain import AlongPath, LosslessFilter
 from stochfuse.engines.events import Event, events
-from stochfuse.engines.monte_carlo import BLOCK, draw_fates, quietly, stopped_together, stream
+from stochfuse.engines.monte_carlo import BLOCK, Links, draw_fates, quietly, stopped_together, stream
 from stochfuse.engines.precision import suspects
 from stochfuse.engines.progress import listener
+from stochfuse.estimators.protocol import Arrivals
 from stochfuse.kalman.kernel import Estimate, from_factor, taken_in
 from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.system import Noises, System
@@ -120,7 +121,7 @@ class _Work(NamedTuple):
 
     outcomes: _Outcomes
     riccati: _Riccati
-    source: Callable[[_Outcomes, int, range, int], Iterator[tuple[range, Iterator[_Arrivals]]]]
+    source: Callable[[_Outcomes, int, range, int], Iterator[tuple[range, Iterator[Arrivals]]]]
     size: int
 
     def follow(self, block: tuple[int, range]) -> tuple[int, int, np.ndarray, np.ndarray | None]:
@@ -184,39 +185,6 @@ def _bytes_of_a_run(system: System, drawn: int) -> int:
 # what becomes of messages and measurements
 
 
-class _Arrivals(NamedTuple):
-    """Messages of a step by what became of them, and what is measured at it.
-
-    Parameters
-    ----------
-    arrived : for every delay 0, 1 … the (run and receiver, run and sender) pairs, numbered run·n + agent, by receiver.
-    missed : (runs, agents) whose sensors miss, or None if nobody's.
-    """
-
-    arrived: list[tuple[np.ndarray, np.ndarray]]
-    missed: np.ndarray | None
-
-
-class _Links:
-    """Events of a step as arrays: who hears whom in which, and for streams of words the thresholds of one row."""
-
-    def __init__(self, drawn: Sequence[Event], agents: int) -> None:
-        each = sorted((i, e.sender, number) for number, e in enumerate(drawn) for i in e.receivers)
-        self.agents, self.delays = agents, max((len(event.delay) for event in drawn), default=1)
-        self.receiver, self.sender, number = np.array(each, dtype=np.intp).reshape(-1, 3).T
-        self.event = None if np.array_equal(number, range(len(drawn))) else number
-
-    def arrived(self, fates: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Pairs of what arrived after each delay, from fates (runs, events), 0 lost, 1 + delay otherwise."""
-        fates = fates if self.event is None else fates[:, self.event]
-        found = []
-        for delay in range(self.delays):
-            run, pair = np.divmod(np.flatnonzero(fates == 1 + delay), max(1, fates.shape[1]))
-            run *= self.agents
-            found.append((run + self.receiver[pair], run + self.sender[pair]))
-        return found
-
-
 class _Outcomes:
     """What outcomes are drawn from."""
 
@@ -224,30 +192,30 @@ class _Outcomes:
         self.system, self.drawn, self.seed = system, drawn, seed
         self.detections = [system.detections(step) for step in range(1, system.steps + 1)]
         different = {id(now): now for now in drawn}
-        links = {key: _Links(now, system.agents) for key, now in different.items()}
+        links = {key: Links(now, system.agents) for key, now in different.items()}
         self.links = [links[id(now)] for now in drawn]
 
 
-def _paired(given: _Outcomes, row: int, block: range, size: int) -> Iterator[tuple[range, Iterator[_Arrivals]]]:
+def _paired(given: _Outcomes, row: int, block: range, size: int) -> Iterator[tuple[range, Iterator[Arrivals]]]:
     """Some runs at a time of a block, with what becomes of each step, as `monte_carlo` draws it."""
     random = stream(given.seed, row, block.start // BLOCK)
     fates, missed = draw_fates(random, given.drawn, given.detections, (len(block), given.system.agents), row)
     for first in range(0, len(block), size):
         some = slice(first, first + size)
 
-        def steps(some: slice = some) -> Iterator[_Arrivals]:
+        def steps(some: slice = some) -> Iterator[Arrivals]:
             for links, fate, lost in zip(given.links, fates, missed, strict=True):
-                yield _Arrivals(links.arrived(fate[some]), lost[some].astype(bool) if lost.any() else None)
+                yield Arrivals(links.arrived(fate[some]), lost[some].astype(bool) if lost.any() else None)
 
         yield block[some], steps()
 
 
-def _own(given: _Outcomes, row: int, block: range, size: int) -> Iterator[tuple[range, Iterator[_Arrivals]]]:
+def _own(given: _Outcomes, row: int, block: range, size: int) -> Iterator[tuple[range, Iterator[Arrivals]]]:
     """All runs of a block, with what becomes of each step, every run from a stream of its own."""
     yield block, _words_followed(given, row, [stream(given.seed, row, run) for run in block])
 
 
-def _words_followed(given: _Outcomes, row: int, streams: Sequence[np.random.Generator]) -> Iterator[_Arrivals]:
+def _words_followed(given: _Outcomes, row: int, streams: Sequence[np.random.Generator]) -> Iterator[Arrivals]:
     chances: dict[int, _Chances] = {}
     bad = None
     for drawn, links, detections in zip(given.drawn, given.links, given.detections, strict=True):
@@ -267,7 +235,7 @@ def _words_followed(given: _Outcomes, row: int, streams: Sequence[np.random.Gene
             words = _words(streams, len(drawn))
             late = np.array([~_below(words, upto) for upto in now.late]).sum(axis=0, dtype=np.uint8)
             fates = fates * (late + np.uint8(1))
-        yield _Arrivals(links.arrived(fates), missed)
+        yield Arrivals(links.arrived(fates), missed)
 
 
 class _Burst(NamedTuple):
@@ -324,7 +292,7 @@ def _below(words: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
 
 
 def _followed(
-    riccati: _Riccati, steps: Iterator[_Arrivals], runs: int, agents: int
+    riccati: _Riccati, steps: Iterator[Arrivals], runs: int, agents: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
     """Covariance (runs, agents, d, d) and bias (runs, agents, d, 1) after every step.
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from stochfuse.engines.events import Event
 from stochfuse.engines.progress import listener, uncollected
-from stochfuse.estimators.protocol import Claims, Estimator, Exchange, Late
+from stochfuse.estimators.protocol import Arrivals, Claims, Estimator, Exchange, Late, Together
 from stochfuse.kalman.kernel import Estimate
 from stochfuse.scenario.system import Detection
 
@@ -28,6 +28,8 @@ BLOCK = 1000
 """Runs drawn from one seed."""
 MOST_BLOCKS = 50
 """Blocks that a process has in hand at a time."""
+MOST_TOGETHER, MOST_NUMBERS = 32, 1 << 26
+"""Runs that are followed at a time, and numbers that are held for them."""
 MERGE_BELOW = 0.2
 """Different histories per run up to which states are merged: beyond, nearly every run goes its own way."""
 
@@ -43,6 +45,7 @@ class Experiment(NamedTuple):
     make : makes the estimator, and what to call for its numbers once all runs have been followed.
     of : makes what is kept of every estimate, a named tuple of arrays or Nones, of a stack of estimates.
     runs, seed : size of the sample per row, and its seed.
+    together : makes what follows so many runs at a time in the estimator's place; None where histories are gathered.
     """
 
     agents: int
@@ -52,6 +55,7 @@ class Experiment(NamedTuple):
     of: Callable[[Estimate], Any]
     runs: int
     seed: int
+    together: Callable[[int], Together] | None = None
 
 
 class Sample(NamedTuple):
@@ -122,7 +126,34 @@ def quietly() -> None:
 def run_blocks(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tuple[Any, np.ndarray]:
     """What is kept, and its index (runs, steps, agents), for some (row, block) pairs."""
     with uncollected():
-        return _run_blocks(experiment, blocks)
+        return (_run_blocks if experiment.together is None else _run_together)(experiment, blocks)
+
+
+def _run_together(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tuple[Any, np.ndarray]:
+    if experiment.together is None:
+        raise ValueError("nothing that follows many runs at a time")
+    links = [Links(events, experiment.agents) for events in experiment.events]
+    parts, found, values, size = [], [], 0, 1
+    for row, block in blocks:
+        fates, missed = _draw(experiment, row, block)
+        runs = len(fates[0])
+        first = 0
+        while first < runs:
+            some = slice(first, min(runs, first + size))
+            follows = experiment.together(some.stop - first)
+            which = np.empty((some.stop - first, len(links), experiment.agents), np.int32)
+            for step, link in enumerate(links):
+                lost = missed[step][some].astype(bool) if missed[step].any() else None
+                estimate, index = follows.exchange(Arrivals(link.arrived(fates[step][some]), lost))
+                parts.append(experiment.of(estimate))
+                which[:, step] = index + values
+                values += len(parts[-1][0])
+            found.append(which)
+            # what the runs take is known once one has been followed
+            first, size = some.stop, max(1, min(MOST_TOGETHER, MOST_NUMBERS // follows.size))
+    columns = zip(*parts, strict=True)
+    kept = type(parts[0])(*(None if c[0] is None else np.concatenate(c) for c in columns))
+    return kept, np.concatenate(found)
 
 
 def _run_blocks(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tuple[Any, np.ndarray]:
@@ -215,6 +246,37 @@ class _Histories:
     def onward(self) -> list[Exchange]:
         """Next exchange of every pair."""
         return [exchange.onward(heard, late, missed) for exchange, heard, late, missed in self.each]
+
+
+class Links:
+    """Events of a step as arrays: who hears whom in which.
+
+    Parameters
+    ----------
+    drawn : events of the step.
+    agents : number of agents.
+    """
+
+    def __init__(self, drawn: Sequence[Event], agents: int) -> None:
+        each = sorted((i, e.sender, number) for number, e in enumerate(drawn) for i in e.receivers)
+        self.agents, self.delays = agents, max((len(event.delay) for event in drawn), default=1)
+        self.receiver, self.sender, number = np.array(each, dtype=np.intp).reshape(-1, 3).T
+        self.event = None if np.array_equal(number, range(len(drawn))) else number
+
+    def arrived(self, fates: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Pairs of what arrived after each delay, see `Arrivals`.
+
+        Parameters
+        ----------
+        fates : (runs, events), 0 lost, 1 + delay otherwise.
+        """
+        fates = fates if self.event is None else fates[:, self.event]
+        found = []
+        for delay in range(self.delays):
+            run, pair = np.divmod(np.flatnonzero(fates == 1 + delay), max(1, fates.shape[1]))
+            run *= self.agents
+            found.append((run + self.receiver[pair], run + self.sender[pair]))
+        return found
 
 
 def _moved(fates: np.ndarray, events: Sequence[Event], place_of: np.ndarray) -> np.ndarray:

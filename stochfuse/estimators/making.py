@@ -15,7 +15,8 @@ import numpy as np
 
 from stochfuse.errors import UsageError
 from stochfuse.estimators.ledger import InformationClaims, Ledger, Sources, evaluate
-from stochfuse.estimators.protocol import Made
+from stochfuse.estimators.pedigrees import GraphTogether
+from stochfuse.estimators.protocol import Made, Together
 from stochfuse.estimators.readings import Readings
 from stochfuse.estimators.recursion import PastClaims, Pasts, RecursiveEstimator
 from stochfuse.estimators.world import World, error_sources, sources_of, world_of
@@ -69,6 +70,24 @@ def make(
     ledger = Ledger(system.sensor_of if errors else None)
     estimator = rule(ledger, labels, shared=system.shared, relabellings=relabellings)
     return Made(name, estimator, partial(_of_sums, ledger, errors, records))
+
+
+def make_together(
+    system: System, name: str, *, errors: bool = False, records: np.ndarray | None = None, criterion: str = "det"
+) -> Callable[[int], Together] | None:
+    """Make what follows so many outcomes at a time in an estimator's place; None if nothing does.
+
+    Parameters and errors are those of `make`.
+    """
+    if name != registry.LFG:
+        return None
+    labels = tuple(range(system.agents)) if errors or records is not None else system.sensor_of
+    given = sources(system, Noises(), errors, records)
+    return partial(_graphs, given, labels, system)
+
+
+def _graphs(given: Sources, labels: Sequence[int], system: System, runs: int) -> Together:
+    return GraphTogether(given, labels, system.shared, runs, system.steps)
 
 
 def make_for_data(system: System, name: str, criterion: str = "det") -> Any:

@@ -18,7 +18,7 @@ from stochfuse.engines.contact_sample import sample_optimum
 from stochfuse.engines.events import events, relabellings
 from stochfuse.engines.monte_carlo import Experiment, Sample, sample
 from stochfuse.errors import UsageError
-from stochfuse.estimators.making import make
+from stochfuse.estimators.making import make, make_together
 from stochfuse.estimators.protocol import Claims, Estimator
 from stochfuse.estimators.world import claimed_only, moments
 from stochfuse.kalman.metrics import Metric, Moments
@@ -33,6 +33,8 @@ MOST_AGENTS, MOST_NUMBERS = 60, 500_000_000
 """Agents whose sets fit a machine word, and claimed values that a sample may hold."""
 MOST_OF_OPTIMUM, FEW, MOST_ENTRIES = 1000, 12, 200_000_000
 """Agents of the optimum; those up to which equal histories, gathered, pay; entries of its covariances in a sample."""
+FEW_TOGETHER = 6
+"""Agents up to which equal histories, gathered, pay more than following many runs at a time."""
 MANY = 10_000
 """Runs, over all rows, from which on another process pays for its start."""
 ROUNDING = 1e-13
@@ -200,6 +202,9 @@ def _drawn(
         of=spread if records is not None else moments if errors else claimed_only,
         runs=how.runs,
         seed=how.seed,
+        together=make_together(system, how.estimator, errors=errors, records=records, criterion=how.criterion)
+        if network.agents > FEW_TOGETHER
+        else None,
     )
     workers = how.workers
     if workers is None:
