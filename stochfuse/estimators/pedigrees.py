@@ -20,6 +20,7 @@ is put in; here sums that cancel meet in floating point, which costs a few digit
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -29,10 +30,12 @@ from stochfuse.estimators.ledger import COMMON, Sources, brought_forward, estima
 from stochfuse.estimators.protocol import Arrivals
 from stochfuse.kalman.kernel import Estimate
 
-AT_A_TIME = 4096
-"""Sets of which intersections are sought at a time, at most 2^13."""
-CACHED = 1 << 23
-"""Bytes of rows that these sets are expected to take."""
+LISTED = 4
+"""Maximal nodes of a set of which all intersections are listed before equal ones are put together."""
+AT_A_TIME, MOST_SETS = 1 << 16, 1 << 13
+"""Terms, about, and sets that are at hand at a time."""
+TOLD = np.uint64(51)
+"""Bits that tell the intersections of one set apart; the others number the sets."""
 MOST_ROWS = 1 << 31
 """Bytes of intersections of the sets at hand beyond which a machine has too little memory."""
 NARROW = 8
@@ -42,12 +45,23 @@ _RANDOM = np.random.default_rng(5).integers(1 << 64, size=(3, 1 << 13), dtype=np
 
 
 class _Terms(NamedTuple):
-    """Intersections in the sums of some sets: of which set, sorted; coefficient; and rows with their hashes."""
+    """Intersections in the sums of some sets.
 
-    of: np.ndarray
+    Parameters
+    ----------
+    keys : number of the set, and from the bit `TOLD` down a hash of the intersection; sorted.
+    times : coefficient.
+    rows : latest steps.
+    """
+
+    keys: np.ndarray
     times: np.ndarray
     rows: np.ndarray
-    hashes: np.ndarray
+
+    @property
+    def of(self) -> np.ndarray:
+        """Number of the set."""
+        return (self.keys >> TOLD).astype(np.intp)
 
 
 class _Sums(NamedTuple):
@@ -95,13 +109,13 @@ class GraphTogether:
         self._room, self._number = np.zeros((2 * items, *start.shape)), 0
         self._steps = np.zeros(0, dtype=np.intp)
         self._found: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._each: dict[int, float] = {}
         self._fused = np.zeros(items, dtype=np.intp)
-        self._most = 1.0
         if shared:
             self._known[:, self.agents] = 1
             first = self._known[:: self.agents]
             common = packed(sources.starts[COMMON])
-            self._add(0, self._keys(_hashes(first), np.arange(runs)), np.repeat(common[None], runs, axis=0))
+            self._add(0, self._keys(_hashes(_words(first)), np.arange(runs)), np.repeat(common[None], runs, axis=0))
         self._step, self._schedule = 0, []
 
     @property
@@ -119,7 +133,7 @@ class GraphTogether:
         self._locals(now.missed)
         self._schedule.append(now.arrived)
         self._hear()
-        keys = self._keys(_hashes(self._known), self._run)
+        keys = self._keys(_hashes(_words(self._known)), self._run)
         first, which = _different(keys)
         places = self._valued(self._known[first], keys[first], self._run[first])
         self._fused = places[which]
@@ -145,7 +159,7 @@ class GraphTogether:
             else:
                 there = ~missed.ravel()
                 values[there] += seen[kind_of[there]]
-        self._add(step, self._keys(_hashes(rows), self._run), values)
+        self._add(step, self._keys(_hashes(_words(rows)), self._run), values)
 
     def _hear(self) -> None:
         """Let everyone know what the nodes that arrive rest on."""
@@ -180,42 +194,39 @@ class GraphTogether:
         first = first[self._places(np.full(len(first), level), keys[first]) < 0]
         rows, keys, run = rows[first], keys[first], run[first]
         places = self._add(level, keys, 0.0)
-        size = int(max(1, min(AT_A_TIME, CACHED // (rows.shape[1] * rows.itemsize * self._most))))
-        for begin in range(0, len(rows), size):
-            some = slice(begin, begin + size)
-            order, terms = self._terms(rows[some], run[some])
-            self._most = max(len(terms.of) / len(order), 1.0)
-            of_run = run[some][order][terms.of]
-            term_keys = self._keys(terms.hashes, of_run)
-            first, which = _different(term_keys)
-            different = term_keys[first]
-            levels = terms.rows[first][:, : self.agents].max(axis=1).astype(np.intp)
-            unknown = self._places(levels, different) < 0
-            for below in np.unique(levels[unknown]).tolist():
-                here = first[unknown & (levels == below)]
-                wanted.setdefault(below, []).append((terms.rows[here], term_keys[here], of_run[here]))
-            ends = np.searchsorted(terms.of, np.arange(len(order) + 1))
-            yield _Sums(places[some][order], ends, terms.times, which, levels, different)
+        tops, number = self._maximal(rows, run * self.agents)
+        for heard in np.unique(number).tolist():
+            members = np.flatnonzero(number == heard)
+            begin = 0
+            while begin < len(members):
+                # as many as are expected to make so many terms, judged by the last ones
+                each = self._each.get(heard, 2.0 ** min(heard, LISTED + 2))
+                some = members[begin : begin + min(MOST_SETS, int(AT_A_TIME / each) + 1)]
+                begin += len(some)
+                terms = self._terms(tops[:heard, some])
+                of = terms.of
+                self._each[heard] = max(len(of) / len(some), 2.0 ** min(heard, LISTED))
+                term_keys = self._keys(_hashes(_words(terms.rows)), run[some][of])
+                first, which = _different(term_keys)
+                different, levels = term_keys[first], terms.rows[first, : self.agents].max(axis=1).astype(np.intp)
+                unknown = self._places(levels, different) < 0
+                for below in np.unique(levels[unknown]).tolist():
+                    here = first[unknown & (levels == below)]
+                    wanted.setdefault(below, []).append((terms.rows[here], term_keys[here], run[some][of[here]]))
+                ends = np.searchsorted(of, np.arange(len(some) + 1))
+                yield _Sums(places[some], ends, terms.times, which, levels, different)
 
-    def _terms(self, sets: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, _Terms]:
-        """Intersections of the maximal nodes' pedigrees with their coefficients, and the order of the sets in them."""
-        tops, number = self._maximal(sets, run * self.agents)
-        order = np.argsort(-number, kind="stable")
-        tops, number = tops[:, order], number[order]
-        nodes = _words(self._nodes).reshape(-1, _words(sets).shape[1])
-        terms = _no_terms(sets)
-        finished: list[_Terms] = []
-        for each in tops:
-            active = len(order) if each[-1] >= 0 else int(np.argmax(each < 0))
-            end = int(np.searchsorted(terms.of, active))
-            if end < len(terms.of):
-                finished.append(_Terms(*(part[end:] for part in terms)))
-                terms = _Terms(*(part[:end] for part in terms))
-            terms = _joined(terms, nodes.take(each[:active], axis=0).view(sets.dtype))
+    def _terms(self, tops: np.ndarray) -> _Terms:
+        """Intersections of the pedigrees of sets' maximal nodes (number, sets), latest first, with coefficients."""
+        nodes = _words(self._nodes).reshape(-1, self._nodes.shape[-1] * self._nodes.itemsize // 8)
+        # the small pedigrees first: what they leave is soon alike
+        brought = (nodes.take(top, axis=0).view(self._nodes.dtype) for top in tops[::-1])
+        terms = _listed(list(islice(brought, LISTED)))
+        for each in brought:
+            terms = _joined(terms, each)
             if terms.rows.nbytes > MOST_ROWS:
-                raise self._too_many(int(number[terms.of[-1]]), len(terms.of))
-        parts = [terms, *reversed(finished)]
-        return order, _Terms(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+                raise self._too_many(len(tops), len(terms.keys))
+        return terms
 
     def _maximal(self, sets: np.ndarray, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nodes without a descendant in each set, latest first, (most, sets), −1 where there is none; and how many."""
@@ -302,29 +313,36 @@ class GraphTogether:
         )
 
 
-def _no_terms(sets: np.ndarray) -> _Terms:
-    none = np.zeros(0, dtype=np.intp)
-    return _Terms(none, none, sets[:0], none.astype(np.uint64))
+def _listed(tops: Sequence[np.ndarray]) -> _Terms:
+    """Terms of sets with few maximal nodes: every intersection, then equal ones together."""
+    rows, times = tops[0][None], np.ones(1, dtype=np.intp)
+    for each in tops[1:]:
+        rows = np.concatenate([rows, np.minimum(rows, each), each[None]])
+        times = np.concatenate([times, -times, [1]])
+    sets = np.arange(len(tops[0]))
+    return _together(_words(rows.reshape(-1, rows.shape[-1])), np.repeat(times, len(sets)), np.tile(sets, len(times)), rows.dtype)
 
 
 def _joined(terms: _Terms, tops: np.ndarray) -> _Terms:
     """Terms of sets with one maximal node more each."""
-    width = tops.shape[1]
-    shared = np.minimum(terms.rows, _words(tops).take(terms.of, axis=0).view(tops.dtype).reshape(-1, width))
-    of = np.concatenate([terms.of, terms.of, np.arange(len(tops))])
-    times = np.concatenate([terms.times, -terms.times, np.ones(len(tops), dtype=terms.times.dtype)])
-    new = np.concatenate([shared, tops])
-    hashes = np.concatenate([terms.hashes, _hashes(new)])
-    keys = of.astype(np.uint64) << np.uint64(51) | hashes >> np.uint64(13)
+    of = terms.of
+    shared = _words(np.minimum(terms.rows, _words(tops).take(of, axis=0).view(tops.dtype)))
+    rows = np.concatenate([_words(terms.rows), shared, _words(tops)])
+    times = np.concatenate([terms.times, -terms.times, np.ones(len(tops), dtype=np.intp)])
+    return _together(rows, times, np.concatenate([of, of, np.arange(len(tops))]), tops.dtype)
+
+
+def _together(words: np.ndarray, times: np.ndarray, of: np.ndarray, kind: np.dtype) -> _Terms:
+    """Terms of sets, of each set equal ones added up."""
+    keys = of.astype(np.uint64) << TOLD | _hashes(words) >> np.uint64(64) - TOLD
     order = np.argsort(keys)
-    keys = keys[order]
+    keys = keys.take(order)
     starts = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
-    total = np.add.reduceat(times[order], starts)
-    first = order[starts]
-    kept = (total != 0) & (hashes[first] != 0)  # nothing shared has the hash 0
-    first, total = first[kept], total[kept]
-    rows = np.concatenate([_words(terms.rows), _words(new)]).take(first, axis=0).view(tops.dtype)
-    return _Terms(of[first], total, rows, hashes[first])
+    total, keys = np.add.reduceat(times.take(order), starts), keys.take(starts)
+    # where nothing is shared the hash is 0
+    kept = np.flatnonzero((total != 0) & (keys << np.uint64(64) - TOLD != 0))
+    rows = words.take(order.take(starts.take(kept)), axis=0).view(kind)
+    return _Terms(keys.take(kept), total.take(kept), rows)
 
 
 def _different(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -338,12 +356,12 @@ def _different(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _words(rows: np.ndarray) -> np.ndarray:
+    """Rows of latest steps in words of 64 bits, that move and compare faster."""
     return np.ascontiguousarray(rows).view(np.uint64)
 
 
-def _hashes(rows: np.ndarray) -> np.ndarray:
-    """One number of 64 bits for every row, 0 for the empty one."""
-    words = _words(rows)
+def _hashes(words: np.ndarray) -> np.ndarray:
+    """One number of 64 bits for every row of words, 0 for the empty one."""
     one, other = _RANDOM[:2, : words.shape[1]]
     half = np.uint64(32)
     if words.shape[1] > NARROW:
