@@ -32,7 +32,7 @@ import numpy as np
 
 from stochfuse.engines.contact_chain import AlongPath, LosslessFilter
 from stochfuse.engines.events import Event, events
-from stochfuse.engines.monte_carlo import BLOCK, Links, draw_fates, quietly, stopped_together, stream
+from stochfuse.engines.monte_carlo import BLOCK, draw_fates, links_of, quietly, stopped_together, stream
 from stochfuse.engines.precision import suspects
 from stochfuse.engines.progress import listener
 from stochfuse.estimators.protocol import Arrivals
@@ -191,9 +191,7 @@ class _Outcomes:
     def __init__(self, system: System, drawn: Sequence[list[Event]], seed: int) -> None:
         self.system, self.drawn, self.seed = system, drawn, seed
         self.detections = [system.detections(step) for step in range(1, system.steps + 1)]
-        different = {id(now): now for now in drawn}
-        links = {key: Links(now, system.agents) for key, now in different.items()}
-        self.links = [links[id(now)] for now in drawn]
+        self.links = links_of(drawn, system.agents)
 
 
 def _paired(given: _Outcomes, row: int, block: range, size: int) -> Iterator[tuple[range, Iterator[Arrivals]]]:

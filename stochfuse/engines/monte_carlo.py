@@ -30,6 +30,8 @@ MOST_BLOCKS = 50
 """Blocks that a process has in hand at a time."""
 MOST_TOGETHER, MOST_NUMBERS = 32, 1 << 26
 """Runs that are followed at a time, and numbers that are held for them."""
+DRAWN = 1 << 20
+"""Random numbers that are drawn at a time."""
 MERGE_BELOW = 0.2
 """Different histories per run up to which states are merged: beyond, nearly every run goes its own way."""
 
@@ -132,19 +134,20 @@ def run_blocks(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tup
 def _run_together(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tuple[Any, np.ndarray]:
     if experiment.together is None:
         raise ValueError("nothing that follows many runs at a time")
-    links = [Links(events, experiment.agents) for events in experiment.events]
+    links = links_of(experiment.events, experiment.agents)
     parts, found, values, size = [], [], 0, 1
     for row, block in blocks:
-        fates, missed = _draw(experiment, row, block)
-        runs = len(fates[0])
-        first = 0
+        runs, first = _runs_of(block, experiment.runs), 0
+        drawn = _drawn_by_step(experiment, row, block)
+        steps = [
+            Arrivals(link.arrived(fates), _any(missed)) for link, (fates, missed) in zip(links, drawn, strict=True)
+        ]
         while first < runs:
             some = slice(first, min(runs, first + size))
             follows = experiment.together(some.stop - first)
             which = np.empty((some.stop - first, len(links), experiment.agents), np.int32)
-            for step, link in enumerate(links):
-                lost = missed[step][some].astype(bool) if missed[step].any() else None
-                estimate, index = follows.exchange(Arrivals(link.arrived(fates[step][some]), lost))
+            for step, now in enumerate(steps):
+                estimate, index = follows.exchange(_of_runs(now, some, experiment.agents))
                 parts.append(experiment.of(estimate))
                 which[:, step] = index + values
                 values += len(parts[-1][0])
@@ -154,6 +157,19 @@ def _run_together(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> 
     columns = zip(*parts, strict=True)
     kept = type(parts[0])(*(None if c[0] is None else np.concatenate(c) for c in columns))
     return kept, np.concatenate(found)
+
+
+def _of_runs(now: Arrivals, runs: slice, agents: int) -> Arrivals:
+    """What becomes of a step in some of the runs."""
+    found = []
+    for receiver, sender in now.arrived:
+        some = slice(*np.searchsorted(receiver, [runs.start * agents, runs.stop * agents]).tolist())
+        found.append((receiver[some] - runs.start * agents, sender[some] - runs.start * agents))
+    return Arrivals(found, None if now.missed is None else now.missed[runs])
+
+
+def _any(missed: np.ndarray) -> np.ndarray | None:
+    return missed.astype(bool) if missed.any() else None
 
 
 def _run_blocks(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tuple[Any, np.ndarray]:
@@ -218,12 +234,15 @@ class _Histories:
     ) -> None:
         self.estimator, self.agents = estimator, agents
         fates = different[:, 1 : 1 + len(events)]
-        missed = different[:, 1 + len(events) :] @ (1 << np.arange(different.shape[1] - 1 - len(events)))
-        heard = np.tile(1 << np.arange(agents), (len(different), 1))
+        # masks of more agents than an integer of the machine has bits are Python's own
+        kind = np.int64 if agents < 63 else object
+        missing = different[:, 1 + len(events) :].astype(kind)
+        missed = missing @ np.array([1 << i for i in range(missing.shape[1])], dtype=kind)
+        heard = np.tile(np.array([1 << i for i in range(agents)], dtype=kind), (len(different), 1))
         late: list[list[Late]] = [[] for _ in range(len(different))]
         for event, fate in zip(events, fates.T, strict=True):
             for receiver in event.receivers:
-                heard[:, receiver] |= (fate == 1).astype(int) << event.sender
+                heard[:, receiver] |= (fate == 1).astype(kind) * (1 << event.sender)
                 for pair in np.flatnonzero(fate > 1):
                     late[pair].append(Late(receiver, int(fate[pair]) - 1, event.sender))
         of = [exchanges[exchange] for exchange in different[:, 0]]
@@ -279,6 +298,13 @@ class Links:
         return found
 
 
+def links_of(events: Sequence[Sequence[Event]], agents: int) -> list[Links]:
+    """Links of every step; steps with the same list of events share them."""
+    different = {id(now): now for now in events}
+    links = {key: Links(now, agents) for key, now in different.items()}
+    return [links[id(now)] for now in events]
+
+
 def _moved(fates: np.ndarray, events: Sequence[Event], place_of: np.ndarray) -> np.ndarray:
     """Fates of the events among places, from those among agents, (runs, events)."""
     number = {(event.sender, event.receivers): e for e, event in enumerate(events)}
@@ -310,8 +336,13 @@ def _runs_of(block: int, runs: int) -> int:
 
 def _draw(experiment: Experiment, row: int, block: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Fates and misses of a block, see `draw_fates`."""
+    fates, missed = zip(*_drawn_by_step(experiment, row, block), strict=True)
+    return list(fates), list(missed)
+
+
+def _drawn_by_step(experiment: Experiment, row: int, block: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     size = _runs_of(block, experiment.runs), experiment.agents
-    return draw_fates(stream(experiment.seed, row, block), experiment.events, experiment.detections, size, row)
+    return fates_by_step(stream(experiment.seed, row, block), experiment.events, experiment.detections, size, row)
 
 
 def stream(seed: int, row: int, number: int) -> np.random.Generator:
@@ -341,31 +372,50 @@ def draw_fates(
         Per step: fates of the events (runs, events), 0 lost, 1 + delay otherwise; and which agents' sensors miss,
         (runs, agents).
     """
-    runs, agents = size
-    out, missing, bad = [], [], None
+    fates, missed = zip(*fates_by_step(generator, events, detections, size, row), strict=True)
+    return list(fates), list(missed)
+
+
+def fates_by_step(
+    generator: np.random.Generator,
+    events: Sequence[Sequence[Event]],
+    detections: Sequence[Sequence[Detection]],
+    size: tuple[int, int],
+    row: int = 0,
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Draw the same, a step at a time."""
+    (runs, agents), bad = size, None
+    chances: dict[int, tuple[np.ndarray, np.ndarray, int]] = {}
     for now, draws in zip(events, detections, strict=True):
         missed = np.zeros((runs, agents), dtype=np.int64)
         for agent, p in draws:
             missed[:, agent] = generator.random(runs) >= p
-        missing.append(missed)
-        µ = np.array([event.probability[row] for event in now])
-        bursts = [event.burst[row] for event in now if event.burst is not None]
-        if bursts:
-            to_bad, to_good, good_µ, bad_µ = np.array(bursts).T
+        if id(now) not in chances:
+            bursts = np.array([event.burst[row] for event in now if event.burst is not None])
+            longest = max((len(event.delay) for event in now), default=1)
+            chances = {id(now): (np.array([event.probability[row] for event in now]), bursts, longest)}
+        µ, bursts, longest = chances[id(now)]
+        if len(bursts):
+            to_bad, to_good, good_µ, bad_µ = bursts.T
             change = to_bad / (to_bad + to_good) if bad is None else np.where(bad, 1.0 - to_good, to_bad)
-            bad = generator.random((runs, len(now))) < change
+            bad = _comes_about(generator, change, (runs, len(now)))
             µ = np.where(bad, bad_µ, good_µ)
-        arrived = generator.random((runs, len(now))) < µ
-        out.append(np.where(arrived, 1 + _delays(now, runs, generator), 0))
-    return out, missing
+        fates = _comes_about(generator, µ, (runs, len(now))).view(np.uint8)
+        yield (fates if longest == 1 else np.where(fates, 1 + _delays(now, runs, generator), 0)), missed
 
 
-def _delays(events: Sequence[Event], runs: int, generator: np.random.Generator) -> np.ndarray | int:
+def _comes_about(generator: np.random.Generator, p: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Whether what has a probability comes about, (runs, events): some runs at a time, so that memory does."""
+    out, size = np.empty(shape, dtype=bool), max(1, DRAWN // max(1, shape[1]))
+    for first in range(0, shape[0], size):
+        some = slice(first, first + size)
+        np.less(generator.random(out[some].shape), p[some] if p.ndim == 2 else p, out=out[some])
+    return out
+
+
+def _delays(events: Sequence[Event], runs: int, generator: np.random.Generator) -> np.ndarray:
     """Steps that each message takes, (runs, events)."""
-    longest = max((len(event.delay) for event in events), default=1)
-    if longest == 1:
-        return 0
-    drawn, late = generator.random((runs, len(events))), np.empty((runs, len(events)), dtype=np.int64)
+    drawn, late = generator.random((runs, len(events))), np.empty((runs, len(events)), dtype=np.uint8)
     for place, event in enumerate(events):
         within = np.searchsorted(np.cumsum(event.delay), drawn[:, place], side="right")
         late[:, place] = np.minimum(within, len(event.delay) - 1)

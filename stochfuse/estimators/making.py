@@ -19,6 +19,7 @@ from stochfuse.estimators.pedigrees import GraphTogether
 from stochfuse.estimators.protocol import Made, Together
 from stochfuse.estimators.readings import Readings
 from stochfuse.estimators.recursion import PastClaims, Pasts, RecursiveEstimator
+from stochfuse.estimators.together import NaiveTogether, PastsTogether
 from stochfuse.estimators.world import World, error_sources, sources_of, world_of
 from stochfuse.scenario import capabilities, registry
 from stochfuse.scenario.network import default_rows
@@ -79,15 +80,21 @@ def make_together(
 
     Parameters and errors are those of `make`.
     """
-    if name != registry.LFG:
-        return None
-    labels = tuple(range(system.agents)) if errors or records is not None else system.sensor_of
-    given = sources(system, Noises(), errors, records)
-    return partial(_graphs, given, labels, system)
-
-
-def _graphs(given: Sources, labels: Sequence[int], system: System, runs: int) -> Together:
-    return GraphTogether(given, labels, system.shared, runs, system.steps)
+    entry, rule = registry.estimator(name), rule_of(name)
+    if entry.sums:
+        labels = tuple(range(system.agents)) if errors or records is not None else system.sensor_of
+        if name == registry.LFG:
+            return partial(
+                GraphTogether, sources(system, Noises(), errors, records), labels, system.shared, system.steps
+            )
+        if name == registry.NAIVE:
+            return partial(NaiveTogether, sources(system, Noises(), errors, records), labels, system.shared)
+    elif (entry.weighs or name == registry.STAND_ALONE) and not (system.own or system.filters) and records is None:
+        if errors:
+            _check_footprints(system, name)
+        more = {"criterion": criterion} if entry.weighs else {}
+        return partial(PastsTogether, rule(world_of(system), system.labels, errors=errors, **more))
+    return None
 
 
 def make_for_data(system: System, name: str, criterion: str = "det") -> Any:

@@ -28,6 +28,7 @@ import numpy as np
 from stochfuse.errors import TooManyError
 from stochfuse.estimators.ledger import COMMON, Sources, brought_forward, estimated, packed, unpacked
 from stochfuse.estimators.protocol import Arrivals
+from stochfuse.estimators.together import measured_too
 from stochfuse.kalman.kernel import Estimate
 
 LISTED = 4
@@ -92,11 +93,11 @@ class GraphTogether:
     sources : what starts and measurements are worth.
     of : source of every agent.
     shared : whether all agents start from one common estimate.
-    runs : number of outcomes.
     steps : number of steps.
+    runs : number of outcomes.
     """
 
-    def __init__(self, sources: Sources, of: Sequence[int], shared: bool, runs: int, steps: int) -> None:
+    def __init__(self, sources: Sources, of: Sequence[int], shared: bool, steps: int, runs: int) -> None:
         self.sources, self.of, self.runs, self.agents = sources, of, runs, len(of)
         kind = np.uint8 if steps < 256 else np.uint16
         size = 8 // np.dtype(kind).itemsize
@@ -151,14 +152,7 @@ class GraphTogether:
         else:
             different, which = np.unique(self._fused, return_inverse=True)
             values = self._brought(different, step)[which]
-            kinds = sorted(set(self.of))
-            seen = np.stack([packed(self.sources.measured(step, of)) for of in kinds])
-            kind_of = np.tile(np.searchsorted(kinds, self.of), self.runs)
-            if missed is None:
-                values += seen[kind_of]
-            else:
-                there = ~missed.ravel()
-                values[there] += seen[kind_of[there]]
+            measured_too(values, self.sources, self.of, step, missed)
         self._add(step, self._keys(_hashes(_words(rows)), self._run), values)
 
     def _hear(self) -> None:
@@ -320,7 +314,9 @@ def _listed(tops: Sequence[np.ndarray]) -> _Terms:
         rows = np.concatenate([rows, np.minimum(rows, each), each[None]])
         times = np.concatenate([times, -times, [1]])
     sets = np.arange(len(tops[0]))
-    return _together(_words(rows.reshape(-1, rows.shape[-1])), np.repeat(times, len(sets)), np.tile(sets, len(times)), rows.dtype)
+    return _together(
+        _words(rows.reshape(-1, rows.shape[-1])), np.repeat(times, len(sets)), np.tile(sets, len(times)), rows.dtype
+    )
 
 
 def _joined(terms: _Terms, tops: np.ndarray) -> _Terms:

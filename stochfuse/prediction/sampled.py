@@ -29,10 +29,10 @@ from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.registry import OPTIMAL
 from stochfuse.scenario.system import Items, Noises, System
 
-MOST_AGENTS, MOST_NUMBERS = 60, 500_000_000
-"""Agents whose sets fit a machine word, and claimed values that a sample may hold."""
-MOST_OF_OPTIMUM, FEW, MOST_ENTRIES = 1000, 12, 200_000_000
-"""Agents of the optimum; those up to which equal histories, gathered, pay; entries of its covariances in a sample."""
+MOST_NUMBERS = 500_000_000
+"""Claimed values that a sample may hold."""
+FEW, MOST_ENTRIES = 12, 200_000_000
+"""Agents of the optimum up to which equal histories, gathered, pay; entries of its covariances in a sample."""
 FEW_TOGETHER = 6
 """Agents up to which equal histories, gathered, pay more than following many runs at a time."""
 MANY = 10_000
@@ -171,9 +171,6 @@ def _check(system: System, links: LinkRows, how: Settings) -> None:
         if value_of < least:
             raise UsageError(f"{name}: expected a whole number of at least {least}, got {value_of}")
     network, rows = system.network, len(links.link)
-    most = MOST_OF_OPTIMUM if how.estimator == OPTIMAL else MOST_AGENTS
-    if network.agents > most:
-        raise UsageError(f"method 'monte-carlo' takes at most {most} agents, got {network.agents}")
     numbers = how.runs * rows * network.steps * network.agents
     if numbers > MOST_NUMBERS:
         raise UsageError(
@@ -194,9 +191,10 @@ def _drawn(
     """Draw outcomes, and keep what is claimed in them, moments of the errors, or estimates given measurements."""
     network, rows = system.network, len(links.link)
     steps = range(1, network.steps + 1)
+    drawn = [events(network, links, step) for step in (steps if links.varies else steps[:1])]
     experiment = Experiment(
         agents=network.agents,
-        events=[events(network, links, step) for step in steps],
+        events=drawn if links.varies else drawn * network.steps,
         detections=[system.detections(step) if records is None else [] for step in steps],
         make=partial(_made, system, how, permutations, errors, records),
         of=spread if records is not None else moments if errors else claimed_only,
