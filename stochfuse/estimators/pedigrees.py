@@ -37,8 +37,8 @@ AT_A_TIME, MOST_SETS = 1 << 16, 1 << 13
 """Terms, about, and sets that are at hand at a time."""
 TOLD = np.uint64(51)
 """Bits that tell the intersections of one set apart; the others number the sets."""
-MOST_ROWS = 1 << 31
-"""Bytes of intersections of the sets at hand beyond which a machine has too little memory."""
+MOST_ROWS = 1 << 30
+"""Bytes of intersections beyond which, gone through several times, a machine has too little memory."""
 NARROW = 8
 """Words of a row up to which they are gone through one by one."""
 
@@ -194,7 +194,7 @@ class GraphTogether:
             begin = 0
             while begin < len(members):
                 # as many as are expected to make so many terms, judged by the last ones
-                each = self._each.get(heard, 2.0 ** min(heard, LISTED + 2))
+                each = self._each.get(heard, max(2.0 ** min(heard, LISTED), 3.0 * self._each.get(heard - 1, 1.0)))
                 some = members[begin : begin + min(MOST_SETS, int(AT_A_TIME / each) + 1)]
                 begin += len(some)
                 terms = self._terms(tops[:heard, some])
@@ -301,9 +301,9 @@ class GraphTogether:
     def _too_many(self, heard: int, found: int) -> TooManyError:
         return TooManyError(
             f"step {self._step}: the common information of {heard} received estimates is made of up to 2^{heard} = "
-            f"{2.0**heard:.3g} intersections of what they rest on, and {found:,} of them take "
-            f"{MOST_ROWS / 2**30:.3g} GiB already: use --method optimal, or --method monte-carlo of the optimum, "
-            "--method simplified, or links by which fewer are heard"
+            f"{2.0**heard:.3g} intersections of what they rest on, of each set of them that somebody has in common; "
+            f"{found:,} take {MOST_ROWS / 2**30:.3g} GiB already. Expected links by which fewer are heard, or "
+            "--method optimal, --method simplified, or --method monte-carlo --estimator optimal"
         )
 
 
