@@ -11,7 +11,7 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, nullcontext
-from itertools import repeat
+from itertools import pairwise, repeat
 from math import log2
 from multiprocessing import active_children
 from typing import Any, NamedTuple
@@ -24,8 +24,8 @@ from stochfuse.estimators.protocol import Arrivals, Claims, Estimator, Exchange,
 from stochfuse.kalman.kernel import Estimate
 from stochfuse.scenario.system import Detection
 
-BLOCK = 1000
-"""Runs drawn from one seed."""
+BLOCK, MOST_OF_BLOCK = 1000, 60
+"""Runs drawn from one seed, of networks of at most so many agents; see `blocks_of`."""
 MOST_BLOCKS = 50
 """Blocks that a process has in hand at a time."""
 MOST_TOGETHER, MOST_NUMBERS = 32, 1 << 26
@@ -60,6 +60,25 @@ class Experiment(NamedTuple):
     together: Callable[[int], Together] | None = None
 
 
+class Block(NamedTuple):
+    """Runs drawn from one seed.
+
+    Parameters
+    ----------
+    row : of link probabilities.
+    number : of the block among the row's.
+    first : number of its first run among the row's.
+    size : how many runs it has.
+    runs : those of them that are meant.
+    """
+
+    row: int
+    number: int
+    first: int
+    size: int
+    runs: range
+
+
 class Sample(NamedTuple):
     """What is kept of the estimates of every run.
 
@@ -80,7 +99,10 @@ def sample(experiment: Experiment, rows: int, *, workers: int = 1) -> Sample:
     ----------
     workers : processes that share the work; the sample does not depend on them.
     """
-    blocks = [(row, block) for row in range(rows) for block in range(-(-experiment.runs // BLOCK))]
+    blocks = blocks_of(experiment.runs, experiment.agents, rows)
+    if experiment.together is not None:  # outcomes are dear, and to draw a block's again is not
+        pieces = -(-workers // len(blocks))
+        blocks = [piece for block in blocks for piece in _split(block, pieces)]
     # few large parts: the more runs a process has in hand, the more histories it meets twice
     share = min(MOST_BLOCKS, max(1, -(-len(blocks) // max(1, workers))))
     parts = [blocks[first : first + share] for first in range(0, len(blocks), share)]
@@ -99,14 +121,31 @@ def sample(experiment: Experiment, rows: int, *, workers: int = 1) -> Sample:
             found = (task.result() for task in tasks)
         for done, (part, (kept, which)) in enumerate(zip(parts, found, strict=True), start=1):
             which, first = which + sum(len(v[0]) for v in values), 0
-            for row, block in part:
-                runs = _runs_of(block, experiment.runs)
-                index[row, block * BLOCK : block * BLOCK + runs] = which[first : first + runs]
-                first += runs
+            for block in part:
+                here = slice(block.first + block.runs.start, block.first + block.runs.stop)
+                index[block.row, here] = which[first : first + len(block.runs)]
+                first += len(block.runs)
             values.append(kept)
             listener().advance("sampling", done, len(parts))
     columns = zip(*values, strict=True)
     return Sample(type(values[0])(*(None if c[0] is None else np.concatenate(c) for c in columns)), index)
+
+
+def blocks_of(runs: int, agents: int, rows: int) -> list[Block]:
+    """Blocks of so many runs of every row: fewer runs in each where agents, and so links, are many."""
+    size = BLOCK if agents <= MOST_OF_BLOCK else max(1, BLOCK * MOST_OF_BLOCK**2 // agents**2)
+    starts = range(0, runs, size)
+    sizes = [min(size, runs - first) for first in starts]
+    return [
+        Block(row, number, first, size, range(size))
+        for row in range(rows)
+        for number, (first, size) in enumerate(zip(starts, sizes, strict=True))
+    ]
+
+
+def _split(block: Block, pieces: int) -> list[Block]:
+    ends = [block.size * piece // pieces for piece in range(pieces + 1)]
+    return [block._replace(runs=range(a, b)) for a, b in pairwise(ends) if a < b]
 
 
 @contextmanager
@@ -125,29 +164,27 @@ def quietly() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def run_blocks(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tuple[Any, np.ndarray]:
-    """What is kept, and its index (runs, steps, agents), for some (row, block) pairs."""
+def run_blocks(experiment: Experiment, blocks: Sequence[Block]) -> tuple[Any, np.ndarray]:
+    """What is kept, and its index (runs, steps, agents), for some blocks."""
     with uncollected():
         return (_run_blocks if experiment.together is None else _run_together)(experiment, blocks)
 
 
-def _run_together(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tuple[Any, np.ndarray]:
+def _run_together(experiment: Experiment, blocks: Sequence[Block]) -> tuple[Any, np.ndarray]:
     if experiment.together is None:
         raise ValueError("nothing that follows many runs at a time")
     links = links_of(experiment.events, experiment.agents)
     parts, found, values, size = [], [], 0, 1
-    for row, block in blocks:
-        runs, first = _runs_of(block, experiment.runs), 0
-        drawn = _drawn_by_step(experiment, row, block)
-        steps = [
-            Arrivals(link.arrived(fates), _any(missed)) for link, (fates, missed) in zip(links, drawn, strict=True)
-        ]
+    for block in blocks:
+        first, runs = block.runs.start, block.runs.stop
+        drawn = _drawn_by_step(experiment, block)
+        steps = [arrivals(link, *now) for link, now in zip(links, drawn, strict=True)]
         while first < runs:
             some = slice(first, min(runs, first + size))
             follows = experiment.together(some.stop - first)
             which = np.empty((some.stop - first, len(links), experiment.agents), np.int32)
             for step, now in enumerate(steps):
-                estimate, index = follows.exchange(_of_runs(now, some, experiment.agents))
+                estimate, index = follows.exchange(of_runs(now, some, experiment.agents))
                 parts.append(experiment.of(estimate))
                 which[:, step] = index + values
                 values += len(parts[-1][0])
@@ -159,7 +196,12 @@ def _run_together(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> 
     return kept, np.concatenate(found)
 
 
-def _of_runs(now: Arrivals, runs: slice, agents: int) -> Arrivals:
+def arrivals(links: Links, fates: np.ndarray, missed: np.ndarray) -> Arrivals:
+    """What becomes of a step, from fates and misses as they are drawn."""
+    return Arrivals(links.arrived(fates), missed.astype(bool) if missed.any() else None)
+
+
+def of_runs(now: Arrivals, runs: slice, agents: int) -> Arrivals:
     """What becomes of a step in some of the runs."""
     found = []
     for receiver, sender in now.arrived:
@@ -168,13 +210,9 @@ def _of_runs(now: Arrivals, runs: slice, agents: int) -> Arrivals:
     return Arrivals(found, None if now.missed is None else now.missed[runs])
 
 
-def _any(missed: np.ndarray) -> np.ndarray | None:
-    return missed.astype(bool) if missed.any() else None
-
-
-def _run_blocks(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tuple[Any, np.ndarray]:
+def _run_blocks(experiment: Experiment, blocks: Sequence[Block]) -> tuple[Any, np.ndarray]:
     estimator, claims = experiment.make()
-    drawn = [_draw(experiment, row, block) for row, block in blocks]
+    drawn = [_draw(experiment, block) for block in blocks]
     runs = sum(len(fates[0]) for fates, _ in drawn)
     claimed = np.empty((runs, len(experiment.events), experiment.agents), np.int32)
     exchanges, exchange_of = [estimator.exchange(estimator.start())], np.zeros(runs, dtype=np.int64)
@@ -330,19 +368,16 @@ def _distinct(exchange_of: np.ndarray, fates: np.ndarray, options: int) -> tuple
     return different, pair_of.ravel()
 
 
-def _runs_of(block: int, runs: int) -> int:
-    return min(BLOCK, runs - block * BLOCK)
-
-
-def _draw(experiment: Experiment, row: int, block: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def _draw(experiment: Experiment, block: Block) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Fates and misses of a block, see `draw_fates`."""
-    fates, missed = zip(*_drawn_by_step(experiment, row, block), strict=True)
+    fates, missed = zip(*_drawn_by_step(experiment, block), strict=True)
     return list(fates), list(missed)
 
 
-def _drawn_by_step(experiment: Experiment, row: int, block: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    size = _runs_of(block, experiment.runs), experiment.agents
-    return fates_by_step(stream(experiment.seed, row, block), experiment.events, experiment.detections, size, row)
+def _drawn_by_step(experiment: Experiment, block: Block) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    generator = stream(experiment.seed, block.row, block.number)
+    size = block.size, experiment.agents
+    return fates_by_step(generator, experiment.events, experiment.detections, size, block.row)
 
 
 def stream(seed: int, row: int, number: int) -> np.random.Generator:

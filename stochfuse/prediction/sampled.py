@@ -206,7 +206,8 @@ def _drawn(
     )
     workers = how.workers
     if workers is None:
-        workers = len(os.sched_getaffinity(0)) if how.runs * rows >= MANY else 1
+        outcomes = how.runs * rows * (1 if experiment.together is None else network.agents)
+        workers = len(os.sched_getaffinity(0)) if outcomes >= MANY else 1
     return sample(experiment, rows, workers=workers)
 
 
