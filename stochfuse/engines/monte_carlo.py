@@ -175,6 +175,7 @@ def _run_together(experiment: Experiment, blocks: Sequence[Block]) -> tuple[Any,
         raise ValueError("nothing that follows many runs at a time")
     links = links_of(experiment.events, experiment.agents)
     parts, found, values, size = [], [], 0, 1
+    done, total = 0, sum(len(block.runs) for block in blocks)
     for block in blocks:
         first, runs = block.runs.start, block.runs.stop
         drawn = _drawn_by_step(experiment, block)
@@ -189,6 +190,8 @@ def _run_together(experiment: Experiment, blocks: Sequence[Block]) -> tuple[Any,
                 which[:, step] = index + values
                 values += len(parts[-1][0])
             found.append(which)
+            done += len(which)
+            listener().advance("runs", done, total)
             # what the runs take is known once one has been followed
             first, size = some.stop, max(1, min(MOST_TOGETHER, MOST_NUMBERS // follows.size))
     columns = zip(*parts, strict=True)
