@@ -174,7 +174,8 @@ class GraphTogether:
         for level in range(self._step, 0, -1):
             some = wanted.pop(level, [])
             if some:
-                sums.append(list(self._summed(level, *(np.concatenate(c) for c in zip(*some, strict=True)), wanted)))
+                rows_now, keys_now, run_now = (np.concatenate(column) for column in zip(*some, strict=True))
+                sums.append(list(self._summed(level, rows_now, keys_now, run_now, wanted)))
         for level_sums in reversed(sums):
             if level_sums:
                 self._evaluate(level_sums)
@@ -194,7 +195,7 @@ class GraphTogether:
             begin = 0
             while begin < len(members):
                 # as many as are expected to make so many terms, judged by the last ones
-                each = self._each.get(heard, max(2.0 ** min(heard, LISTED), 3.0 * self._each.get(heard - 1, 1.0)))
+                each = self._each.get(heard) or max(2.0 ** min(heard, LISTED), 3.0 * self._each.get(heard - 1, 1.0))
                 some = members[begin : begin + min(MOST_SETS, int(AT_A_TIME / each) + 1)]
                 begin += len(some)
                 terms = self._terms(tops[:heard, some])
