@@ -154,3 +154,27 @@ def test_hundreds_of_agents(estimator):
         local = [alone] + [1 / (1 / 75 + 1 / 100)] * (n - 1)
         fused = [alone, *(1 / (1 / a + 1 / b - 1 / 125) for a, b in pairwise(local))]
         np.testing.assert_allclose(got[1], fused, rtol=1e-12)
+
+
+@pytest.mark.parametrize("estimator", ["local-fusion-graph", "covariance-intersection"])
+def test_processes_share_the_runs_of_a_block(estimator, monkeypatch):
+    given = scenario("delays, misses, bursts", steps=3)
+    one, two = (
+        drawn(given, monkeypatch, 0, estimator=estimator, quantity="actual", runs=7, workers=workers)
+        for workers in (1, 2)
+    )
+    for alone, shared in zip(one, two, strict=True):
+        np.testing.assert_allclose(shared, alone, rtol=1e-11, atol=1e-12)
+
+
+def test_runs_of_many_agents_are_drawn_in_smaller_blocks(monkeypatch):
+    """As many links in each, about, as in one of a thousand runs of sixty agents."""
+    monkeypatch.setattr(monte_carlo, "MOST_OF_BLOCK", 0)
+    monkeypatch.setattr(monte_carlo, "BLOCK", 3)
+    blocks = monte_carlo.blocks_of(5, 4, 2)
+    assert [(b.row, b.number, b.first, b.size) for b in blocks] == [
+        (row, number, number, 1) for row in range(2) for number in range(5)
+    ]
+    monkeypatch.setattr(monte_carlo, "MOST_OF_BLOCK", 4)
+    assert [b.size for b in monte_carlo.blocks_of(5, 8, 1)] == [1] * 5
+    assert [(b.first, b.size) for b in monte_carlo.blocks_of(5, 4, 1)] == [(0, 3), (3, 2)]
