@@ -70,7 +70,7 @@ def drawn_arrivals(system: System, links: LinkRows, missed: np.ndarray, seed: in
     heard: list[np.ndarray] = []
     late: dict[tuple[int, int], list[Late]] = {}
     for step, now in enumerate(by_step):
-        fates = np.concatenate([fates[step] for fates in of_runs])
+        fates = np.concatenate([fates[step] for fates in of_runs]).astype(np.int64)
         for event, fate in zip(now, fates.T, strict=True):
             came = np.flatnonzero(fate == 1)
             for receiver in event.receivers:

@@ -17,30 +17,38 @@ What makes it fast.  Sets are rows of bits, 64 agents a word, so that a product 
 data everybody holds drop out of the products.  At every step an agent's filter is run again only from the first t on
 whose set has grown.  Runs are followed in blocks that fit in memory, and blocks by processes; neither changes a number.
 
-Random numbers.  Up to `MOST_PAIRED` agents they are those of `stochfuse.engines.monte_carlo`: the same arrivals as of
-any other estimator.  Beyond, every run has a stream of its own and probabilities are rounded to multiples of 2⁻³².
+Random numbers are those of `stochfuse.engines.monte_carlo`: the same arrivals as of any other estimator.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from stochfuse.engines.contact_chain import AlongPath, LosslessFilter
-from stochfuse.engines.events import Event, events
-from stochfuse.engines.monte_carlo import BLOCK, draw_fates, quietly, stopped_together, stream
+from stochfuse.engines.events import events
+from stochfuse.engines.monte_carlo import (
+    Block,
+    arrivals,
+    blocks_of,
+    fates_by_step,
+    links_of,
+    of_runs,
+    quietly,
+    stopped_together,
+    stream,
+)
 from stochfuse.engines.precision import suspects
 from stochfuse.engines.progress import listener
+from stochfuse.estimators.protocol import Arrivals
 from stochfuse.kalman.kernel import Estimate, from_factor, taken_in
 from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.system import Noises, System
 
-MOST_PAIRED = 60
-"""Agents up to which the arrivals are those of other estimators."""
 MOST_BYTES = 1 << 25
 """Memory that a block of runs takes at a time, about."""
 MOST_COUNTED = 8
@@ -83,7 +91,6 @@ def sample_optimum(
     *,
     workers: int | None = None,
     most_bytes: int = MOST_BYTES,
-    paired: bool = False,
     first: int = 0,
 ) -> OptimumSample:
     """Draw outcomes and follow the optimum in each.
@@ -94,7 +101,6 @@ def sample_optimum(
     runs, seed : size of the sample per row, and its seed; more runs of a seed begin with the fewer.
     workers : processes that share the work; default: one for small samples, else one per processor.
     most_bytes : memory that a block of runs may take; the sample does not depend on it.
-    paired : whether the arrivals are those of other estimators beyond `MOST_PAIRED` agents, too.
     first : block of `stochfuse.engines.monte_carlo` that the sample begins with.
 
     Notes
@@ -104,14 +110,12 @@ def sample_optimum(
     d, n, K, rows = system.dimension, system.agents, system.steps, len(links.link)
     P = np.empty((rows, runs, K, n, d, d))
     bias = None if system.error is None else np.empty((rows, runs, K, n, d, 1))
-    paired = paired or n <= MOST_PAIRED
-    drawn = _drawn(system, links, paired)
-    size = max(1, most_bytes // _bytes_of_a_run(system, max(map(len, drawn))))
-    source, stride = (_paired, BLOCK) if paired else (_own, size)
-    blocks = [(row, range(start, min(start + stride, runs))) for row in range(rows) for start in range(0, runs, stride)]
-    work = _Work(_Outcomes(system, drawn, seed, first), _Riccati(system), source, size)
+    size = max(1, most_bytes // _bytes_of_a_run(system))
+    blocks = blocks_of(runs, n, rows, first)
+    outcomes = _Outcomes(system, links, seed)
+    work = _Work(outcomes, _Riccati(system), system, size)
     if workers is None:
-        workers = len(os.sched_getaffinity(0)) if rows * runs * sum(map(len, drawn)) >= MANY else 1
+        workers = len(os.sched_getaffinity(0)) if rows * runs * sum(map(len, outcomes.events)) >= MANY else 1
     for done, (row, start, now, left) in enumerate(_all_followed(work, blocks, min(workers, len(blocks))), start=1):
         P[row, start : start + len(now)] = now
         if bias is not None:
@@ -125,25 +129,26 @@ class _Work(NamedTuple):
 
     outcomes: _Outcomes
     riccati: _Riccati
-    source: Callable[[_Outcomes, int, range, int], Iterator[tuple[range, Iterator[_Arrivals]]]]
+    system: System
     size: int
 
-    def follow(self, block: tuple[int, range]) -> tuple[int, int, np.ndarray, np.ndarray | None]:
+    def follow(self, block: Block) -> tuple[int, int, np.ndarray, np.ndarray | None]:
         """Row and first run of a block, covariances (runs, steps, agents, d, d) and biases (…, d, 1)."""
-        row, runs = block
-        system = self.outcomes.system
-        P = np.empty((len(runs), system.steps, system.agents, system.dimension, system.dimension))
+        runs, system = block.size, self.system
+        P = np.empty((runs, system.steps, system.agents, system.dimension, system.dimension))
         bias = None if system.error is None else np.empty((*P.shape[:-1], 1))
-        for some, fates in self.source(self.outcomes, row, runs, self.size):
-            part = slice(some.start - runs.start, some.stop - runs.start)
-            for k, (now, left) in enumerate(_followed(self.riccati, fates, len(some), system.agents)):
+        drawn = self.outcomes.of(block)
+        for first in range(0, runs, self.size):
+            part = slice(first, min(first + self.size, runs))
+            steps = (of_runs(now, part, system.agents) for now in drawn)
+            for k, (now, left) in enumerate(_followed(self.riccati, steps, part.stop - first, system.agents)):
                 P[part, k] = now
                 if bias is not None:
                     bias[part, k] = left
-        return row, runs.start, P, bias
+        return block.row, block.first, P, bias
 
 
-def _all_followed(work: _Work, blocks: Sequence[tuple[int, range]], workers: int) -> Iterator[Any]:
+def _all_followed(work: _Work, blocks: Sequence[Block], workers: int) -> Iterator[Any]:
     """Every block followed, in order: by processes that share them, or here."""
     if workers == 1:
         yield from map(work.follow, blocks)
@@ -161,175 +166,42 @@ def _begin(work: _Work) -> None:
     _shared[:] = [work]
 
 
-def _follow(block: tuple[int, range]) -> Any:
+def _follow(block: Block) -> Any:
     return _shared[0].follow(block)
 
 
-def _drawn(system: System, links: LinkRows, paired: bool) -> list[list[Event]]:
-    """Events of every step; where not paired without those that words of 32 bits never let come about."""
-    K = system.steps
-    drawn = [events(system.network, links, step) for step in range(1, K + 1 if links.varies else 2)]
-    if not paired:
-        drawn = [_possible(now) for now in drawn]
-    return drawn if links.varies else drawn * K
-
-
-def _possible(drawn: list[Event]) -> list[Event]:
-    thresholds = _threshold(np.array([event.probability for event in drawn]))
-    ever = set(np.nonzero(thresholds)[0].tolist())
-    return [event for number, event in enumerate(drawn) if number in ever or event.burst is not None]
-
-
-def _bytes_of_a_run(system: System, drawn: int) -> int:
+def _bytes_of_a_run(system: System) -> int:
     n, K, d = system.agents, system.steps, system.dimension
     sets = 8 * K * (-(-n // WORD)) * (2 + len(system.network.delay))
-    return n * (sets + 8 * K * (d * d + d) + 40 * d * d) + 8 * drawn
+    return n * (sets + 8 * K * (d * d + d) + 40 * d * d)
 
 
 # what becomes of messages and measurements
 
 
-class _Arrivals(NamedTuple):
-    """Messages of a step by what became of them, and what is measured at it.
-
-    Parameters
-    ----------
-    arrived : for every delay 0, 1 … the (run and receiver, run and sender) pairs, numbered run·n + agent, by receiver.
-    missed : (runs, agents) whose sensors miss, or None if nobody's.
-    """
-
-    arrived: list[tuple[np.ndarray, np.ndarray]]
-    missed: np.ndarray | None
-
-
-class _Links:
-    """Events of a step as arrays: who hears whom in which, and for streams of words the thresholds of one row."""
-
-    def __init__(self, drawn: Sequence[Event], agents: int) -> None:
-        each = sorted((i, e.sender, number) for number, e in enumerate(drawn) for i in e.receivers)
-        self.agents, self.delays = agents, max((len(event.delay) for event in drawn), default=1)
-        self.receiver, self.sender, number = np.array(each, dtype=np.intp).reshape(-1, 3).T
-        self.event = None if np.array_equal(number, range(len(drawn))) else number
-
-    def arrived(self, fates: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Pairs of what arrived after each delay, from fates (runs, events), 0 lost, 1 + delay otherwise."""
-        fates = fates if self.event is None else fates[:, self.event]
-        found = []
-        for delay in range(self.delays):
-            run, pair = np.divmod(np.flatnonzero(fates == 1 + delay), max(1, fates.shape[1]))
-            run *= self.agents
-            found.append((run + self.receiver[pair], run + self.sender[pair]))
-        return found
-
-
 class _Outcomes:
-    """What outcomes are drawn from."""
+    """What outcomes are drawn from: those of `monte_carlo`, the same as of any other estimator."""
 
-    def __init__(self, system: System, drawn: Sequence[list[Event]], seed: int, first: int) -> None:
-        self.system, self.drawn, self.seed, self.first = system, drawn, seed, first
-        self.detections = [system.detections(step) for step in range(1, system.steps + 1)]
-        different = {id(now): now for now in drawn}
-        links = {key: _Links(now, system.agents) for key, now in different.items()}
-        self.links = [links[id(now)] for now in drawn]
+    def __init__(self, system: System, links: LinkRows, seed: int) -> None:
+        steps = range(1, system.steps + 1)
+        drawn = [events(system.network, links, step) for step in (steps if links.varies else steps[:1])]
+        self.agents, self.seed = system.agents, seed
+        self.events = drawn if links.varies else drawn * system.steps
+        self.detections = [system.detections(step) for step in steps]
+        self.links = links_of(self.events, system.agents)
 
-
-def _paired(given: _Outcomes, row: int, block: range, size: int) -> Iterator[tuple[range, Iterator[_Arrivals]]]:
-    """Some runs at a time of a block, with what becomes of each step, as `monte_carlo` draws it."""
-    random = stream(given.seed, row, given.first + block.start // BLOCK)
-    fates, missed = draw_fates(random, given.drawn, given.detections, (len(block), given.system.agents), row)
-    for first in range(0, len(block), size):
-        some = slice(first, first + size)
-
-        def steps(some: slice = some) -> Iterator[_Arrivals]:
-            for links, fate, lost in zip(given.links, fates, missed, strict=True):
-                yield _Arrivals(links.arrived(fate[some]), lost[some].astype(bool) if lost.any() else None)
-
-        yield block[some], steps()
-
-
-def _own(given: _Outcomes, row: int, block: range, size: int) -> Iterator[tuple[range, Iterator[_Arrivals]]]:
-    """All runs of a block, with what becomes of each step, every run from a stream of its own."""
-    yield block, _words_followed(given, row, [stream(given.seed, row, given.first * BLOCK + run) for run in block])
-
-
-def _words_followed(given: _Outcomes, row: int, streams: Sequence[np.random.Generator]) -> Iterator[_Arrivals]:
-    chances: dict[int, _Chances] = {}
-    bad = None
-    for drawn, links, detections in zip(given.drawn, given.links, given.detections, strict=True):
-        if id(drawn) not in chances:
-            chances = {id(drawn): _Chances(drawn, row)}
-        now, missed = chances[id(drawn)], None
-        if detections:
-            agents, p = np.array(detections).T
-            missed = np.zeros((len(streams), given.system.agents), dtype=bool)
-            missed[:, agents.astype(int)] = ~_below(_words(streams, len(agents)), _threshold(p))
-        arrival = now.arrival
-        if now.burst is not None:
-            bad = now.burst.next(bad, _words(streams, len(drawn)))
-            arrival = np.where(bad, now.burst.bad, now.burst.good)
-        fates = _below(_words(streams, len(drawn)), arrival).view(np.uint8)
-        if now.late:
-            words = _words(streams, len(drawn))
-            late = np.array([~_below(words, upto) for upto in now.late]).sum(axis=0, dtype=np.uint8)
-            fates = fates * (late + np.uint8(1))
-        yield _Arrivals(links.arrived(fates), missed)
-
-
-class _Burst(NamedTuple):
-    """Thresholds of bursty links: to be bad at first, to turn bad, to stay bad, and to deliver when good and bad."""
-
-    first: np.ndarray
-    turn: np.ndarray
-    stay: np.ndarray
-    good: np.ndarray
-    bad: np.ndarray
-
-    def next(self, bad: np.ndarray | None, words: np.ndarray) -> np.ndarray:
-        """Whether links are bad, from whether they were; None before the first step."""
-        return _below(words, self.first if bad is None else np.where(bad, self.stay, self.turn))
-
-
-class _Chances:
-    """Thresholds of a row for the words of a step's events."""
-
-    def __init__(self, drawn: Sequence[Event], row: int) -> None:
-        self.arrival = _threshold(np.array([event.probability[row] for event in drawn]))
-        self.burst, self.late = None, []
-        if any(event.burst is not None for event in drawn):
-            to_bad, to_good, good, bad = np.array([e.burst[row] for e in drawn if e.burst is not None]).T
-            self.burst = _Burst(*map(_threshold, (to_bad / (to_bad + to_good), to_bad, 1.0 - to_good, good, bad)))
-        longest = max((len(event.delay) for event in drawn), default=1)
-        if longest > 1:
-            upto = np.array([np.cumsum([*e.delay, *(0.0,) * (longest - len(e.delay))]) for e in drawn])
-            last = np.array([len(e.delay) for e in drawn])[:, None] <= np.arange(1, longest + 1)
-            self.late = [_threshold(column) for column in np.where(last, 1.0, upto).T[:-1]]
-
-
-def _words(streams: Sequence[np.random.Generator], count: int) -> np.ndarray:
-    """Random words of 32 bits, (streams, count)."""
-    out = np.empty((len(streams), -(-count // 2)), dtype=np.uint64)
-    for words, each in zip(out, streams, strict=True):
-        words[:] = each.bit_generator.random_raw(len(words))
-    return out.view(np.uint32)[:, :count]
-
-
-def _threshold(p: np.ndarray) -> np.ndarray:
-    """Number of words of 32 bits, of all 2³², that stand for a probability."""
-    return np.rint(np.asarray(p) * 2.0**32).astype(np.uint64)
-
-
-def _below(words: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
-    """Whether what has a probability comes about: 2³² is no word, so that certain is certain."""
-    certain = thresholds >> 32 != 0
-    small = words < thresholds.astype(np.uint32)
-    return small | certain if certain.any() else small
+    def of(self, block: Block) -> list[Arrivals]:
+        """What becomes of every step in the runs of a block."""
+        random, size = stream(self.seed, block.row, block.number), (block.size, self.agents)
+        drawn = fates_by_step(random, self.events, self.detections, size, block.row)
+        return [arrivals(link, *now) for link, now in zip(self.links, drawn, strict=True)]
 
 
 # whose measurements are held
 
 
 def _followed(
-    riccati: _Riccati, steps: Iterator[_Arrivals], runs: int, agents: int
+    riccati: _Riccati, steps: Iterator[Arrivals], runs: int, agents: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
     """Covariance (runs, agents, d, d) and bias (runs, agents, d, 1) after every step.
 

@@ -11,7 +11,7 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, nullcontext
-from itertools import repeat
+from itertools import pairwise, repeat
 from math import log2
 from multiprocessing import active_children
 from typing import Any, NamedTuple
@@ -20,14 +20,18 @@ import numpy as np
 
 from stochfuse.engines.events import Event
 from stochfuse.engines.progress import listener, uncollected
-from stochfuse.estimators.protocol import Claims, Estimator, Exchange, Late
+from stochfuse.estimators.protocol import Arrivals, Claims, Estimator, Exchange, Late, Together
 from stochfuse.kalman.kernel import Estimate
 from stochfuse.scenario.system import Detection
 
-BLOCK = 1000
-"""Runs drawn from one seed."""
+BLOCK, MOST_OF_BLOCK = 1000, 60
+"""Runs drawn from one seed, of networks of at most so many agents; see `blocks_of`."""
 MOST_BLOCKS = 50
 """Blocks that a process has in hand at a time."""
+MOST_TOGETHER, MOST_NUMBERS = 32, 1 << 26
+"""Runs that are followed at a time, and numbers that are held for them."""
+DRAWN = 1 << 20
+"""Random numbers that are drawn at a time."""
 MERGE_BELOW = 0.2
 """Different histories per run up to which states are merged: beyond, nearly every run goes its own way."""
 
@@ -44,6 +48,7 @@ class Experiment(NamedTuple):
     of : makes what is kept of every estimate, a named tuple of arrays or Nones, of a stack of estimates.
     runs, seed : size of the sample per row, and its seed.
     first : block that the sample begins with: those before are of an earlier sample that this one goes on with.
+    together : makes what follows so many runs at a time in the estimator's place; None where histories are gathered.
     """
 
     agents: int
@@ -54,6 +59,26 @@ class Experiment(NamedTuple):
     runs: int
     seed: int
     first: int = 0
+    together: Callable[[int], Together] | None = None
+
+
+class Block(NamedTuple):
+    """Runs drawn from one seed.
+
+    Parameters
+    ----------
+    row : of link probabilities.
+    number : of the block among the row's.
+    first : number of its first run among the row's.
+    size : how many runs it has.
+    runs : those of them that are meant.
+    """
+
+    row: int
+    number: int
+    first: int
+    size: int
+    runs: range
 
 
 class Sample(NamedTuple):
@@ -76,7 +101,10 @@ def sample(experiment: Experiment, rows: int, *, workers: int = 1) -> Sample:
     ----------
     workers : processes that share the work; the sample does not depend on them.
     """
-    blocks = [(row, block) for row in range(rows) for block in range(-(-experiment.runs // BLOCK))]
+    blocks = blocks_of(experiment.runs, experiment.agents, rows, experiment.first)
+    if experiment.together is not None:  # outcomes are dear, and to draw a block's again is not
+        pieces = -(-workers // len(blocks))
+        blocks = [piece for block in blocks for piece in _split(block, pieces)]
     # few large parts: the more runs a process has in hand, the more histories it meets twice
     share = min(MOST_BLOCKS, max(1, -(-len(blocks) // max(1, workers))))
     parts = [blocks[first : first + share] for first in range(0, len(blocks), share)]
@@ -95,14 +123,36 @@ def sample(experiment: Experiment, rows: int, *, workers: int = 1) -> Sample:
             found = (task.result() for task in tasks)
         for done, (part, (kept, which)) in enumerate(zip(parts, found, strict=True), start=1):
             which, first = which + sum(len(v[0]) for v in values), 0
-            for row, block in part:
-                runs = _runs_of(block, experiment.runs)
-                index[row, block * BLOCK : block * BLOCK + runs] = which[first : first + runs]
-                first += runs
+            for block in part:
+                here = slice(block.first + block.runs.start, block.first + block.runs.stop)
+                index[block.row, here] = which[first : first + len(block.runs)]
+                first += len(block.runs)
             values.append(kept)
             listener().advance("sampling", done, len(parts))
     columns = zip(*values, strict=True)
     return Sample(type(values[0])(*(None if c[0] is None else np.concatenate(c) for c in columns)), index)
+
+
+def size_of_block(agents: int) -> int:
+    """Return the runs that are drawn from one seed: fewer where agents, and so links, are many."""
+    return BLOCK if agents <= MOST_OF_BLOCK else max(1, BLOCK * MOST_OF_BLOCK**2 // agents**2)
+
+
+def blocks_of(runs: int, agents: int, rows: int, begin: int = 0) -> list[Block]:
+    """Blocks of so many runs of every row, numbered from some number on."""
+    size = size_of_block(agents)
+    starts = range(0, runs, size)
+    sizes = [min(size, runs - first) for first in starts]
+    return [
+        Block(row, number, first, size, range(size))
+        for row in range(rows)
+        for number, (first, size) in enumerate(zip(starts, sizes, strict=True), start=begin)
+    ]
+
+
+def _split(block: Block, pieces: int) -> list[Block]:
+    ends = [block.size * piece // pieces for piece in range(pieces + 1)]
+    return [block._replace(runs=range(a, b)) for a, b in pairwise(ends) if a < b]
 
 
 @contextmanager
@@ -121,15 +171,58 @@ def quietly() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def run_blocks(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tuple[Any, np.ndarray]:
-    """What is kept, and its index (runs, steps, agents), for some (row, block) pairs."""
+def run_blocks(experiment: Experiment, blocks: Sequence[Block]) -> tuple[Any, np.ndarray]:
+    """What is kept, and its index (runs, steps, agents), for some blocks."""
     with uncollected():
-        return _run_blocks(experiment, blocks)
+        return (_run_blocks if experiment.together is None else _run_together)(experiment, blocks)
 
 
-def _run_blocks(experiment: Experiment, blocks: Sequence[tuple[int, int]]) -> tuple[Any, np.ndarray]:
+def _run_together(experiment: Experiment, blocks: Sequence[Block]) -> tuple[Any, np.ndarray]:
+    if experiment.together is None:
+        raise ValueError("nothing that follows many runs at a time")
+    links = links_of(experiment.events, experiment.agents)
+    parts, found, values, size = [], [], 0, 1
+    done, total = 0, sum(len(block.runs) for block in blocks)
+    for block in blocks:
+        first, runs = block.runs.start, block.runs.stop
+        drawn = _drawn_by_step(experiment, block)
+        steps = [arrivals(link, *now) for link, now in zip(links, drawn, strict=True)]
+        while first < runs:
+            some = slice(first, min(runs, first + size))
+            follows = experiment.together(some.stop - first)
+            which = np.empty((some.stop - first, len(links), experiment.agents), np.int32)
+            for step, now in enumerate(steps):
+                estimate, index = follows.exchange(of_runs(now, some, experiment.agents))
+                parts.append(experiment.of(estimate))
+                which[:, step] = index + values
+                values += len(parts[-1][0])
+            found.append(which)
+            done += len(which)
+            listener().advance("runs", done, total)
+            # what the runs take is known once one has been followed
+            first, size = some.stop, max(1, min(MOST_TOGETHER, MOST_NUMBERS // follows.size))
+    columns = zip(*parts, strict=True)
+    kept = type(parts[0])(*(None if c[0] is None else np.concatenate(c) for c in columns))
+    return kept, np.concatenate(found)
+
+
+def arrivals(links: Links, fates: np.ndarray, missed: np.ndarray) -> Arrivals:
+    """What becomes of a step, from fates and misses as they are drawn."""
+    return Arrivals(links.arrived(fates), missed.astype(bool) if missed.any() else None)
+
+
+def of_runs(now: Arrivals, runs: slice, agents: int) -> Arrivals:
+    """What becomes of a step in some of the runs."""
+    found = []
+    for receiver, sender in now.arrived:
+        some = slice(*np.searchsorted(receiver, [runs.start * agents, runs.stop * agents]).tolist())
+        found.append((receiver[some] - runs.start * agents, sender[some] - runs.start * agents))
+    return Arrivals(found, None if now.missed is None else now.missed[runs])
+
+
+def _run_blocks(experiment: Experiment, blocks: Sequence[Block]) -> tuple[Any, np.ndarray]:
     estimator, claims = experiment.make()
-    drawn = [_draw(experiment, row, block) for row, block in blocks]
+    drawn = [_draw(experiment, block) for block in blocks]
     runs = sum(len(fates[0]) for fates, _ in drawn)
     claimed = np.empty((runs, len(experiment.events), experiment.agents), np.int32)
     exchanges, exchange_of = [estimator.exchange(estimator.start())], np.zeros(runs, dtype=np.int64)
@@ -189,12 +282,15 @@ class _Histories:
     ) -> None:
         self.estimator, self.agents = estimator, agents
         fates = different[:, 1 : 1 + len(events)]
-        missed = different[:, 1 + len(events) :] @ (1 << np.arange(different.shape[1] - 1 - len(events)))
-        heard = np.tile(1 << np.arange(agents), (len(different), 1))
+        # masks of more agents than an integer of the machine has bits are Python's own
+        kind = np.int64 if agents < 63 else object
+        missing = different[:, 1 + len(events) :].astype(kind)
+        missed = missing @ np.array([1 << i for i in range(missing.shape[1])], dtype=kind)
+        heard = np.tile(np.array([1 << i for i in range(agents)], dtype=kind), (len(different), 1))
         late: list[list[Late]] = [[] for _ in range(len(different))]
         for event, fate in zip(events, fates.T, strict=True):
             for receiver in event.receivers:
-                heard[:, receiver] |= (fate == 1).astype(int) << event.sender
+                heard[:, receiver] |= (fate == 1).astype(kind) * (1 << event.sender)
                 for pair in np.flatnonzero(fate > 1):
                     late[pair].append(Late(receiver, int(fate[pair]) - 1, event.sender))
         of = [exchanges[exchange] for exchange in different[:, 0]]
@@ -217,6 +313,44 @@ class _Histories:
     def onward(self) -> list[Exchange]:
         """Next exchange of every pair."""
         return [exchange.onward(heard, late, missed) for exchange, heard, late, missed in self.each]
+
+
+class Links:
+    """Events of a step as arrays: who hears whom in which.
+
+    Parameters
+    ----------
+    drawn : events of the step.
+    agents : number of agents.
+    """
+
+    def __init__(self, drawn: Sequence[Event], agents: int) -> None:
+        each = sorted((i, e.sender, number) for number, e in enumerate(drawn) for i in e.receivers)
+        self.agents, self.delays = agents, max((len(event.delay) for event in drawn), default=1)
+        self.receiver, self.sender, number = np.array(each, dtype=np.intp).reshape(-1, 3).T
+        self.event = None if np.array_equal(number, range(len(drawn))) else number
+
+    def arrived(self, fates: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Pairs of what arrived after each delay, see `Arrivals`.
+
+        Parameters
+        ----------
+        fates : (runs, events), 0 lost, 1 + delay otherwise.
+        """
+        fates = fates if self.event is None else fates[:, self.event]
+        found = []
+        for delay in range(self.delays):
+            run, pair = np.divmod(np.flatnonzero(fates == 1 + delay), max(1, fates.shape[1]))
+            run *= self.agents
+            found.append((run + self.receiver[pair], run + self.sender[pair]))
+        return found
+
+
+def links_of(events: Sequence[Sequence[Event]], agents: int) -> list[Links]:
+    """Links of every step; steps with the same list of events share them."""
+    different = {id(now): now for now in events}
+    links = {key: Links(now, agents) for key, now in different.items()}
+    return [links[id(now)] for now in events]
 
 
 def _moved(fates: np.ndarray, events: Sequence[Event], place_of: np.ndarray) -> np.ndarray:
@@ -244,15 +378,16 @@ def _distinct(exchange_of: np.ndarray, fates: np.ndarray, options: int) -> tuple
     return different, pair_of.ravel()
 
 
-def _runs_of(block: int, runs: int) -> int:
-    return min(BLOCK, runs - block * BLOCK)
-
-
-def _draw(experiment: Experiment, row: int, block: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def _draw(experiment: Experiment, block: Block) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Fates and misses of a block, see `draw_fates`."""
-    size = _runs_of(block, experiment.runs), experiment.agents
-    random = stream(experiment.seed, row, experiment.first + block)
-    return draw_fates(random, experiment.events, experiment.detections, size, row)
+    fates, missed = zip(*_drawn_by_step(experiment, block), strict=True)
+    return list(fates), list(missed)
+
+
+def _drawn_by_step(experiment: Experiment, block: Block) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    generator = stream(experiment.seed, block.row, block.number)
+    size = block.size, experiment.agents
+    return fates_by_step(generator, experiment.events, experiment.detections, size, block.row)
 
 
 def stream(seed: int, row: int, number: int) -> np.random.Generator:
@@ -282,31 +417,50 @@ def draw_fates(
         Per step: fates of the events (runs, events), 0 lost, 1 + delay otherwise; and which agents' sensors miss,
         (runs, agents).
     """
-    runs, agents = size
-    out, missing, bad = [], [], None
+    fates, missed = zip(*fates_by_step(generator, events, detections, size, row), strict=True)
+    return list(fates), list(missed)
+
+
+def fates_by_step(
+    generator: np.random.Generator,
+    events: Sequence[Sequence[Event]],
+    detections: Sequence[Sequence[Detection]],
+    size: tuple[int, int],
+    row: int = 0,
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Draw the same, a step at a time."""
+    (runs, agents), bad = size, None
+    chances: dict[int, tuple[np.ndarray, np.ndarray, int]] = {}
     for now, draws in zip(events, detections, strict=True):
         missed = np.zeros((runs, agents), dtype=np.int64)
         for agent, p in draws:
             missed[:, agent] = generator.random(runs) >= p
-        missing.append(missed)
-        µ = np.array([event.probability[row] for event in now])
-        bursts = [event.burst[row] for event in now if event.burst is not None]
-        if bursts:
-            to_bad, to_good, good_µ, bad_µ = np.array(bursts).T
+        if id(now) not in chances:
+            bursts = np.array([event.burst[row] for event in now if event.burst is not None])
+            longest = max((len(event.delay) for event in now), default=1)
+            chances = {id(now): (np.array([event.probability[row] for event in now]), bursts, longest)}
+        µ, bursts, longest = chances[id(now)]
+        if len(bursts):
+            to_bad, to_good, good_µ, bad_µ = bursts.T
             change = to_bad / (to_bad + to_good) if bad is None else np.where(bad, 1.0 - to_good, to_bad)
-            bad = generator.random((runs, len(now))) < change
+            bad = _comes_about(generator, change, (runs, len(now)))
             µ = np.where(bad, bad_µ, good_µ)
-        arrived = generator.random((runs, len(now))) < µ
-        out.append(np.where(arrived, 1 + _delays(now, runs, generator), 0))
-    return out, missing
+        fates = _comes_about(generator, µ, (runs, len(now))).view(np.uint8)
+        yield (fates if longest == 1 else np.where(fates, 1 + _delays(now, runs, generator), 0)), missed
 
 
-def _delays(events: Sequence[Event], runs: int, generator: np.random.Generator) -> np.ndarray | int:
+def _comes_about(generator: np.random.Generator, p: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Whether what has a probability comes about, (runs, events): some runs at a time, so that memory does."""
+    out, size = np.empty(shape, dtype=bool), max(1, DRAWN // max(1, shape[1]))
+    for first in range(0, shape[0], size):
+        some = slice(first, first + size)
+        np.less(generator.random(out[some].shape), p[some] if p.ndim == 2 else p, out=out[some])
+    return out
+
+
+def _delays(events: Sequence[Event], runs: int, generator: np.random.Generator) -> np.ndarray:
     """Steps that each message takes, (runs, events)."""
-    longest = max((len(event.delay) for event in events), default=1)
-    if longest == 1:
-        return 0
-    drawn, late = generator.random((runs, len(events))), np.empty((runs, len(events)), dtype=np.int64)
+    drawn, late = generator.random((runs, len(events))), np.empty((runs, len(events)), dtype=np.uint8)
     for place, event in enumerate(events):
         within = np.searchsorted(np.cumsum(event.delay), drawn[:, place], side="right")
         late[:, place] = np.minimum(within, len(event.delay) - 1)

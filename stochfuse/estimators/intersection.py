@@ -32,7 +32,7 @@ TOGETHER, RELATED = "intersection", "related intersection"
 class SplitCovarianceIntersection(RecursiveEstimator):
     """The estimator; parameters are those of `RecursiveEstimator`, and the criterion that the weights minimise."""
 
-    symmetric = (TOGETHER,)
+    symmetric, gathers = (TOGETHER,), TOGETHER
     split = True
     """Whether anything is taken for independent."""
 

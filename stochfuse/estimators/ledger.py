@@ -291,19 +291,30 @@ def evaluate_atoms(
     for step in range(1, int(atom_step.max()) + 1):
         brought = np.flatnonzero(prior & (atom_step == step))
         if len(brought):
-            before = unpacked(total(of[brought], out), sources)
-            check_definite(before.Y, step - 1, rounding=1e-9)
-            try:
-                out[brought] = _packed(sources.forward(before, step))
-            except np.linalg.LinAlgError:
-                raise UsageError(
-                    f"the covariance predicted for step {step} is singular, and the common information is its inverse: "
-                    "expected an invertible model.F, or a model.Q that fills what it leaves out"
-                ) from None
+            out[brought] = brought_forward(total(of[brought], out), sources, step)
         for atom in np.flatnonzero(~prior & (atom_step == step)).tolist():
             kind, _, source = atoms[atom]
-            out[atom] = _packed(sources.starts[source] if kind == START else sources.measured(step, source))
+            out[atom] = packed(sources.starts[source] if kind == START else sources.measured(step, source))
     return out
+
+
+def brought_forward(values: np.ndarray, sources: Sources, step: int) -> np.ndarray:
+    """Values of the step before, Y and y side by side, brought forward to a step.
+
+    Raises
+    ------
+    NoAnswerError, UsageError
+        As `evaluate`.
+    """
+    before = unpacked(values, sources)
+    check_definite(before.Y, step - 1, rounding=1e-9)
+    try:
+        return packed(sources.forward(before, step))
+    except np.linalg.LinAlgError:
+        raise UsageError(
+            f"the covariance predicted for step {step} is singular, and the common information is its inverse: "
+            "expected an invertible model.F, or a model.Q that fills what it leaves out"
+        ) from None
 
 
 class InformationClaims:
@@ -381,7 +392,8 @@ def _diagonal(A: np.ndarray) -> np.ndarray:
     return np.diagonal(A, axis1=-2, axis2=-1)
 
 
-def _packed(information: Information) -> np.ndarray:
+def packed(information: Information) -> np.ndarray:
+    """Return Y and y of information pairs side by side in an array."""
     y, Y = information
     return Y if y is None else np.concatenate([Y, y], axis=-1)
 

@@ -15,9 +15,11 @@ import numpy as np
 
 from stochfuse.errors import UsageError
 from stochfuse.estimators.ledger import InformationClaims, Ledger, Sources, evaluate
-from stochfuse.estimators.protocol import Made
+from stochfuse.estimators.pedigrees import GraphTogether
+from stochfuse.estimators.protocol import Made, Together
 from stochfuse.estimators.readings import Readings
 from stochfuse.estimators.recursion import PastClaims, Pasts, RecursiveEstimator
+from stochfuse.estimators.together import NaiveTogether, PastsTogether
 from stochfuse.estimators.world import World, error_sources, sources_of, world_of
 from stochfuse.scenario import capabilities, registry
 from stochfuse.scenario.network import default_rows
@@ -69,6 +71,30 @@ def make(
     ledger = Ledger(system.sensor_of if errors else None)
     estimator = rule(ledger, labels, shared=system.shared, relabellings=relabellings)
     return Made(name, estimator, partial(_of_sums, ledger, errors, records))
+
+
+def make_together(
+    system: System, name: str, *, errors: bool = False, records: np.ndarray | None = None, criterion: str = "det"
+) -> Callable[[int], Together] | None:
+    """Make what follows so many outcomes at a time in an estimator's place; None if nothing does.
+
+    Parameters and errors are those of `make`.
+    """
+    entry, rule = registry.estimator(name), rule_of(name)
+    if entry.sums:
+        labels = tuple(range(system.agents)) if errors or records is not None else system.sensor_of
+        if name == registry.LFG:
+            return partial(
+                GraphTogether, sources(system, Noises(), errors, records), labels, system.shared, system.steps
+            )
+        if name == registry.NAIVE:
+            return partial(NaiveTogether, sources(system, Noises(), errors, records), labels, system.shared)
+    elif (entry.weighs or name == registry.STAND_ALONE) and not (system.own or system.filters) and records is None:
+        if errors:
+            _check_footprints(system, name)
+        more = {"criterion": criterion} if entry.weighs else {}
+        return partial(PastsTogether, rule(world_of(system), system.labels, errors=errors, **more))
+    return None
 
 
 def make_for_data(system: System, name: str, criterion: str = "det") -> Any:

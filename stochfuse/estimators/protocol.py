@@ -125,6 +125,36 @@ class Claims(Protocol):
         ...
 
 
+class Arrivals(NamedTuple):
+    """What becomes of a step in many outcomes.
+
+    Parameters
+    ----------
+    arrived : for every delay 0, 1 … the (run and receiver, run and sender) pairs of the messages sent at this step that
+        arrive after it, numbered run·n + agent, by receiver.
+    missed : (runs, agents) whose sensors miss at this step, or None if nobody's.
+    """
+
+    arrived: list[tuple[np.ndarray, np.ndarray]]
+    missed: np.ndarray | None
+
+
+class Together(Protocol):
+    """An estimator that follows many outcomes at a time, numbers and all: what sampling of large networks uses.
+
+    Attributes
+    ----------
+    size : numbers held of every outcome, about.
+    """
+
+    @property
+    def size(self) -> int: ...
+
+    def exchange(self, now: Arrivals) -> tuple[Any, np.ndarray]:
+        """Estimates (or `Moments`) after the next step's exchange, and which of them each agent has, (runs, agents)."""
+        ...
+
+
 class Made(NamedTuple):
     """An estimator by its name, and what makes numbers, of a system and noises of items, of all it has written down."""
 

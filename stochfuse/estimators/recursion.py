@@ -75,6 +75,8 @@ class RecursiveEstimator:
     """
 
     additive, joint = False, False
+    gathers: str | None = None
+    """Name of the rule by which agents that track one state fuse all that they hear; None if they fuse nothing."""
     symmetric: tuple[str, ...] = ()
     mixed: tuple[str, ...] = ()
 

@@ -40,7 +40,7 @@ from stochfuse.engines.contact_chain import (
 )
 from stochfuse.engines.contact_sample import sample_optimum
 from stochfuse.engines.enclosure import enclosed_optimum
-from stochfuse.engines.monte_carlo import BLOCK
+from stochfuse.engines.monte_carlo import size_of_block
 from stochfuse.errors import UsageError
 from stochfuse.kalman.metrics import Moments
 from stochfuse.prediction.method import Settings
@@ -207,10 +207,7 @@ def optimum_of(system: System, links: LinkRows, how: Settings, blocks: list[tupl
     ----------
     blocks : number of runs, and first block of random numbers, of every part of the sample.
     """
-    parts = [
-        sample_optimum(system, links, runs, how.seed, workers=how.workers, paired=True, first=first)
-        for runs, first in blocks
-    ]
+    parts = [sample_optimum(system, links, runs, how.seed, workers=how.workers, first=first) for runs, first in blocks]
     P = np.concatenate([part.P for part in parts], axis=1)
     return _moments(P, np.concatenate([b for part in parts if (b := part.bias) is not None] or [P[:0]], axis=1))
 
@@ -261,7 +258,7 @@ def estimated(system: System, links: LinkRows, how: Settings, correlation: float
     further = min(max(best, least), most)
     runs = ceil(further * how.runs)
     numbers = len(links.link) * system.steps * system.agents * system.dimension**2
-    size = max(2, min(BLOCK, -(-runs // (2 * BLOCKS)), MOST_HELD // numbers))
+    size = max(2, min(size_of_block(system.agents), -(-runs // (2 * BLOCKS)), MOST_HELD // numbers))
     blocks = -(-runs // size)
     follow = partial(sample_optimum, system, links, size, how.seed, workers=how.workers)
     found = [_mean(follow(first=SEPARATE + block)) for block in range(blocks)]

@@ -52,7 +52,7 @@ from stochfuse.scenario.system import Items, Noises, System
 
 MOST_PROBABILITIES = 20_000_000
 """Probabilities that a distribution may hold at a time."""
-MOST_AGENTS, MOST_SENDERS = 40, 12
+MOST_LINKED, MOST_SENDERS = 40, 12
 """Agents, and agents that one of them may hear, up to which outcomes are listed."""
 KEPT = 8
 """Structures kept for what is asked next."""
@@ -745,10 +745,11 @@ def groups_alike(
 
 
 def check_size(network: Network) -> None:
-    """Raise TooManyError if there are too many agents to list what one of them may hear."""
-    if number_of_senders(network.architecture, network.agents) > MOST_SENDERS or network.agents > MOST_AGENTS:
+    """Raise TooManyError if what the agents may hear at one step is too much to list."""
+    n, senders = network.agents, number_of_senders(network.architecture, network.agents)
+    if senders > MOST_SENDERS or n > MOST_LINKED:
+        drawn = n if network.architecture == "broadcast" else n * senders
         raise TooManyError(
-            f"every outcome is gone through for at most {MOST_AGENTS} agents that hear at most {MOST_SENDERS} "
-            f"others each, got {network.agents} agents, {network.architecture}: use --method optimal or "
-            "--method monte-carlo"
+            f"one exchange of {n} agents, {network.architecture}, has 2^{drawn} outcomes, too many "
+            "to go through: use --method optimal or --method monte-carlo"
         )

@@ -25,9 +25,9 @@ import numpy as np
 
 from stochfuse.engines.contact_sample import sample_optimum
 from stochfuse.engines.events import concerning, events, relabellings
-from stochfuse.engines.monte_carlo import Experiment, Sample, sample
+from stochfuse.engines.monte_carlo import Experiment, Sample, sample, size_of_block
 from stochfuse.errors import UsageError
-from stochfuse.estimators.making import make
+from stochfuse.estimators.making import make, make_together
 from stochfuse.estimators.protocol import Claims, Estimator
 from stochfuse.estimators.world import claimed_only, moments
 from stochfuse.kalman.metrics import Metric, Moments
@@ -52,10 +52,12 @@ from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.registry import NO_CONTROL, OPTIMAL, STAND_ALONE
 from stochfuse.scenario.system import Items, Noises, System
 
-MOST_AGENTS, MOST_NUMBERS = 60, 500_000_000
-"""Agents whose sets fit a machine word, and claimed values that a sample may hold."""
-MOST_OF_OPTIMUM, FEW, MOST_ENTRIES = 1000, 12, 200_000_000
-"""Agents of the optimum; those up to which equal histories, gathered, pay; entries of its covariances in a sample."""
+MOST_NUMBERS = 500_000_000
+"""Claimed values that a sample may hold."""
+FEW, MOST_ENTRIES = 12, 200_000_000
+"""Agents of the optimum up to which equal histories, gathered, pay; entries of its covariances in a sample."""
+FEW_TOGETHER = 6
+"""Agents up to which equal histories, gathered, pay more than following many runs at a time."""
 MANY = 10_000
 """Runs, over all rows, from which on another process pays for its start."""
 ROUNDING = 1e-13
@@ -272,7 +274,9 @@ def sampled(
     numbers = len(links.link) * system.steps * system.agents
     most = min(MOST_NUMBERS // numbers, MOST_HELD // numbers // system.dimension**2)
     limit = None if how.at_most is None else seconds(how.at_most)
-    (found, said, control), reached = sampled_to(share(how.precision), limit, most, draw, judge)
+    (found, said, control), reached = sampled_to(
+        share(how.precision), limit, most, size_of_block(system.agents), draw, judge
+    )
     meta = {"control": control._asdict(), "precision": {"asked": reached.asked, "reached": reached.reached}}
     told = f"precision {100 * reached.reached:.2g} % of each value after {found.runs:,} runs"
     told += f", {100 * reached.asked:.3g} % asked for: {reached.stopped}" if reached.stopped else ""
@@ -407,9 +411,6 @@ def _check(system: System, links: LinkRows, how: Settings) -> None:
         if value_of < least:
             raise UsageError(f"{name}: expected a whole number of at least {least}, got {value_of}")
     network, rows = system.network, len(links.link)
-    most = MOST_OF_OPTIMUM if how.estimator == OPTIMAL else MOST_AGENTS
-    if network.agents > most:
-        raise UsageError(f"method 'monte-carlo' takes at most {most} agents, got {network.agents}")
     numbers = how.runs * rows * network.steps * network.agents
     if numbers > MOST_NUMBERS:
         raise UsageError(
@@ -431,19 +432,24 @@ def _drawn(
     """Draw outcomes, and keep what is claimed in them, moments of the errors, or estimates given measurements."""
     network, rows = system.network, len(links.link)
     steps = range(1, network.steps + 1)
+    drawn = [events(network, links, step) for step in (steps if links.varies else steps[:1])]
     experiment = Experiment(
         agents=network.agents,
-        events=[events(network, links, step) for step in steps],
+        events=drawn if links.varies else drawn * network.steps,
         detections=[system.detections(step) if records is None else [] for step in steps],
         make=partial(_made, system, how, permutations, errors, records),
         of=spread if records is not None else moments if errors else claimed_only,
         runs=how.runs,
         seed=how.seed,
         first=first,
+        together=make_together(system, how.estimator, errors=errors, records=records, criterion=how.criterion)
+        if network.agents > FEW_TOGETHER
+        else None,
     )
     workers = how.workers
     if workers is None:
-        workers = len(os.sched_getaffinity(0)) if how.runs * rows >= MANY else 1
+        outcomes = how.runs * rows * (1 if experiment.together is None else network.agents)
+        workers = len(os.sched_getaffinity(0)) if outcomes >= MANY else 1
     return sample(experiment, rows, workers=workers)
 
 

@@ -55,13 +55,14 @@ class _Drawing:
     ----------
     draw : goes on with a sample (None at first), by so many runs, from a block of random numbers on.
     at_most : seconds, or None.
+    block : runs that are drawn from one seed.
     said : what is drawn for, in words.
     """
 
-    def __init__(self, draw: Callable[[Any, int, int], Any], at_most: float | None, said: str) -> None:
+    def __init__(self, draw: Callable[[Any, int, int], Any], at_most: float | None, block: int, said: str) -> None:
         self.sample: Any = None
         self.parts: Parts = []
-        self._draw, self._said, self._begun = draw, said, time.monotonic()
+        self._draw, self._said, self._block, self._begun = draw, said, block, time.monotonic()
         self._end = inf if at_most is None else self._begun + at_most
 
     @property
@@ -84,7 +85,7 @@ class _Drawing:
                 now = min(now, FEW)  # which show what a run takes
             told = f", about {left:.0f} s left" if self.parts else ""
             with within(f"{self._said}{told}", self.runs + 1, target):
-                first = sum(-(-runs // BLOCK) for runs, _ in self.parts)
+                first = sum(-(-runs // self._block) for runs, _ in self.parts)
                 self.sample = self._draw(self.sample, now, first)
             self.parts.append((now, first))
         return True
@@ -94,6 +95,7 @@ def sampled_to(
     asked: float,
     at_most: float | None,
     most: int,
+    block: int,
     draw: Callable[[Any, int, int], Any],
     judge: Callable[[Any, Parts], tuple[Any, float]],
 ) -> tuple[Any, Reached]:
@@ -103,10 +105,11 @@ def sampled_to(
     ----------
     asked, at_most : precision, and seconds or None.
     most : runs that can be held.
+    block : runs that are drawn from one seed.
     draw : goes on with a sample (None at first), by so many runs, from a block of random numbers on.
     judge : what a sample, of some parts, comes to, and its largest share of a standard error in its value.
     """
-    drawing, target = _Drawing(draw, at_most, f"to {100 * asked:.3g} % of every value"), min(FIRST, most)
+    drawing, target = _Drawing(draw, at_most, block, f"to {100 * asked:.3g} % of every value"), min(FIRST, most)
     while True:
         in_time = drawing.to(target)
         found, reached = judge(drawing.sample, drawing.parts)

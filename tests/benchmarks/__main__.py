@@ -16,7 +16,7 @@ from rich.table import Table
 
 import stochfuse as sf
 from tests.agreement.test_accuracy import CASES
-from tests.benchmarks import chain, growth, intersection, kernel, literal, studies
+from tests.benchmarks import chain, growth, intersection, kernel, literal, sampling, studies
 from tests.oracles import textbook
 from tests.oracles.strategies import mapping
 
@@ -185,6 +185,8 @@ def main() -> None:
     )
     if given.plot:
         chain.plot(grown, given.plot)
+    show("Sampling, CPU time, in one run", sampling.HEADINGS, sampling.ratios(quick))
+    show("Sampling of large networks", sampling.HEADINGS_OF_LARGE, sampling.large(quick))
     show("Studies, in processes of their own", studies.HEADINGS, studies.promised(quick))
     costs = studies.growth(quick)
     for title, found in costs.items():

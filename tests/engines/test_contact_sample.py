@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import stochfuse as sf
-from stochfuse.engines import contact_sample
+from stochfuse.engines import contact_sample, monte_carlo
 from stochfuse.engines.contact_sample import sample_optimum
 from stochfuse.scenario.scenario import link_rows
 
@@ -56,11 +56,6 @@ CASES = {
     "alone": case(SCALAR, {"agents": 1, "link": 0.5}),
     "words": case(SCALAR, {"agents": 130, "link": 0.01, "steps": 5}),
 }
-
-
-@pytest.fixture(params=["as other estimators draw", "streams of their own"])
-def drawing(request, monkeypatch):
-    monkeypatch.setattr(contact_sample, "MOST_PAIRED", 10**6 if request.param.startswith("as") else 0)
 
 
 def outcomes(monkeypatch, name, runs, **settings):
@@ -125,7 +120,7 @@ def check_outcomes(scenario, found, seen):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_every_outcome_by_brute_force(name, drawing, monkeypatch):
+def test_every_outcome_by_brute_force(name, monkeypatch):
     runs = 3 if name == "words" else 25
     scenario, found, seen = outcomes(monkeypatch, name, runs, most_bytes=1 << 14)
     assert sum(size for size, _ in seen) == runs
@@ -147,7 +142,7 @@ EXACT = ["ad hoc", "broadcast", "cyclic", "matrix", "delays", "delays that diffe
 
 
 @pytest.mark.parametrize("name", [*EXACT, "shared start"])
-def test_means_are_those_of_the_exact_chain(name, drawing):
+def test_means_are_those_of_the_exact_chain(name):
     scenario = sf.Scenario.from_mapping(CASES[name])
     exact = sf.predict(scenario, method="optimal")
     found = sample_optimum(scenario.system, link_rows(scenario), 3000, 5)
@@ -167,7 +162,7 @@ def test_runs_are_those_that_are_gathered_by_history():
 
 
 @pytest.mark.parametrize("name", ["delays", "unlike", "misses", "late bursts"])
-def test_the_sample_depends_on_the_seed_alone(name, drawing):
+def test_the_sample_depends_on_the_seed_alone(name):
     scenario = sf.Scenario.from_mapping(CASES[name])
     system, links = scenario.system, link_rows(scenario)
     once = sample_optimum(system, links, 60, 1, workers=1)
@@ -178,7 +173,7 @@ def test_the_sample_depends_on_the_seed_alone(name, drawing):
 
 
 def test_more_runs_of_a_seed_begin_with_the_fewer(monkeypatch):
-    monkeypatch.setattr(contact_sample, "MOST_PAIRED", 0)
+    monkeypatch.setattr(monte_carlo, "BLOCK", 10)
     scenario = sf.Scenario.from_mapping(CASES["matrix"])
     few, many = (sample_optimum(scenario.system, link_rows(scenario), runs, 1) for runs in (10, 30))
     np.testing.assert_allclose(many.P[:, :10], few.P, rtol=1e-13)
@@ -225,8 +220,6 @@ def test_like_agents_beyond_sixty_against_the_chain():
 
 
 def test_what_a_sample_is_refused():
-    with pytest.raises(sf.UsageError, match="takes at most 1000 agents, got 1001"):
-        sf.predict(sf.load_scenario(agents=1001, steps=1), method="monte-carlo", estimator="optimal")
     with pytest.raises(
         sf.UsageError, match=r"9000000 runs for 1 .* are 3.51e\+08 entries of covariances; expected at most"
     ):

@@ -99,8 +99,3 @@ def test_errors_of_one_agent_and_of_the_worst():
 def test_bad_settings(settings, message):
     with pytest.raises(sf.UsageError, match=message):
         sf.predict(sf.load_scenario(), [0.5], method="monte-carlo", **settings)
-
-
-def test_too_many_agents_are_refused():
-    with pytest.raises(sf.UsageError, match="method 'monte-carlo' takes at most 60 agents, got 100"):
-        sf.predict(sf.load_scenario(agents=100, steps=1), [0.5], method="monte-carlo")

@@ -264,7 +264,7 @@ def test_a_failing_point_is_recorded_and_does_not_stop_the_rest(tmp_path):
     reason = {(row["model.R"], row["network.link"], row["network.agents"]): row["error"] for row in failed}
     assert reason["0", "0.5", "3"].startswith("model.R: expected a symmetric positive definite matrix, got a variance")
     assert reason["100", "1.5", "3"].startswith("network.link: expected probabilities between 0 and 1, got 1.5")
-    assert "every outcome is gone through for at most" in reason["100", "0.5", "30"]
+    assert "outcomes, too many to go through: use --method" in reason["100", "0.5", "30"]
     assert reason["0", "1.5", "3"].count("expected") == 2
     assert results.first_errors[0][0] == int(failed[0]["point"])
 
