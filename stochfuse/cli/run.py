@@ -23,7 +23,7 @@ from stochfuse.cli.options import (
     check_files,
     chosen_format,
     completed,
-    estimator_names,
+    named,
     option,
     pairs,
     write_report,
@@ -41,7 +41,8 @@ EXAMPLES = (
 EstimatorsOption = Annotated[
     str | None,
     option(
-        f"One or several: {', '.join(ESTIMATORS[:3])}, … (stochfuse methods); default: the scenario's, else {LFG}.",
+        f"One or several: {', '.join(ESTIMATORS[:3])}, … (stochfuse methods), or your own, module:Class; default: the "
+        f"scenario's, else {LFG}.",
         WORK,
         "--estimator",
         metavar="LIST",
@@ -107,7 +108,7 @@ def run(
 
     if measurements is None:
         raise UsageError("--measurements: expected a file of measurements, got none")
-    names = None if estimator is None else estimator_names(estimator)
+    names = None if estimator is None else named(estimator)
     files = [file for file in (measurements, arrivals, truth, initial) if file is not None]
     if [*files, scenario].count("-") > 1:
         raise UsageError("expected at most one file on standard input, got - for several")

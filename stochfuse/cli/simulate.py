@@ -18,7 +18,7 @@ from stochfuse.cli.options import (
     PlotOption,
     ScenarioArgument,
     check_files,
-    estimator_names,
+    named,
     option,
 )
 from stochfuse.cli.run import CriterionOption, EstimatorsOption, one_link, show
@@ -58,7 +58,7 @@ def simulate(
     """
     from stochfuse.data.simulate import simulate as simulated
 
-    names = None if estimator is None else estimator_names(estimator)
+    names = None if estimator is None else named(estimator)
     if output is not None and output.exists() and not output.is_dir():
         raise UsageError(f"--output: expected a folder, got the file {output}")
     check_files(None, plot, scenario)

@@ -31,7 +31,7 @@ from stochfuse.kalman.metrics import metric as metric_of
 from stochfuse.prediction.predict import predict
 from stochfuse.prediction.result import Prediction
 from stochfuse.scenario.network import LinkRows, stacked_rows
-from stochfuse.scenario.registry import ESTIMATORS, GENERAL, LFG, MONTE_CARLO
+from stochfuse.scenario.registry import BROADCAST_PRIOR, GENERAL, LFG, MONTE_CARLO
 from stochfuse.scenario.result import Result
 from stochfuse.scenario.scenario import Scenario, ScenarioLike, link_rows, load_scenario
 
@@ -150,7 +150,7 @@ def crosscheck(
     again = None
     unsaid = [f for f in _families(read, prediction, chosen)[0] if not knows(prediction, f)]
     if unsaid:
-        whose = prediction.estimator if prediction.estimator in ESTIMATORS else estimator or given.estimator or LFG
+        whose = prediction.estimator if prediction.estimator != BROADCAST_PRIOR else estimator or given.estimator or LFG
         asked = {name: settings[name] for name in ("runs", "seed", "workers", "criterion") if name in settings}
         again = predict(given, rows, MONTE_CARLO, "actual", estimator=whose, **asked)
         what = " and ".join(dict.fromkeys("NEES" if f.quantity == "nees" else f.metric for f in unsaid))

@@ -33,6 +33,7 @@ from stochfuse.kalman.metrics import metric as metric_of
 from stochfuse.prediction.predict import choose, predict
 from stochfuse.scenario import registry
 from stochfuse.scenario.network import LinkRows
+from stochfuse.scenario.own_rules import estimators_named
 from stochfuse.scenario.result import Result
 from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario
 
@@ -223,10 +224,7 @@ def way_of(given: Mapping[str, Any], scenario: Scenario) -> Way:
             raise UsageError(f"{name}: no such setting{nearest(name, known)}; expected {', '.join(known)}")
     rest, asked = dict(given), given.get("estimator") or scenario.estimator or registry.LFG
     rest.pop("estimator", None)
-    names = (asked,) if isinstance(asked, str) else tuple(asked)
-    for name in names:
-        choose("estimator", name, registry.ESTIMATORS)
-    return Way(names, **rest)
+    return Way(estimators_named(asked), **rest)
 
 
 @of_scenario

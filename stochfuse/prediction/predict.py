@@ -27,9 +27,9 @@ from stochfuse.scenario import capabilities, registry
 from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.over import Over
 from stochfuse.scenario.over import over as read_over
+from stochfuse.scenario.own_rules import estimator_named
 from stochfuse.scenario.registry import (
     CRITERIA,
-    ESTIMATORS,
     GENERAL,
     LFG,
     METHODS,
@@ -422,7 +422,7 @@ def _asked(scenario: Scenario, method: str | None, quantity: str, settings: Mapp
         near = nearest(wrong, known)
         raise TypeError(f"predict() got an unexpected keyword argument '{wrong}'{near}; expected {', '.join(known)}")
     how = Settings(**{"estimator": scenario.estimator or LFG, "runs": scenario.runs or RUNS, **settings})
-    choose("estimator", how.estimator, ESTIMATORS)
+    how = replace(how, estimator=estimator_named(how.estimator))
     choose("criterion", how.criterion, CRITERIA)
     if quantity == OPTIMAL:
         method, how = (MONTE_CARLO if method == MONTE_CARLO else OPTIMAL), replace(how, estimator=OPTIMAL)
@@ -431,8 +431,8 @@ def _asked(scenario: Scenario, method: str | None, quantity: str, settings: Mapp
 
 def _by_any(scenario: Scenario, link: Any, quantity: str, settings: Mapping[str, Any]) -> Prediction:
     """Predict an estimator by the exact engine that takes it, else by sampling, and say which."""
-    name = settings["estimator"]
-    choose("estimator", name, ESTIMATORS)
+    name = estimator_named(settings["estimator"])
+    settings = {**settings, "estimator": name}
     features = capabilities.features_of(scenario.system, link_rows(scenario, link))
     engines = capabilities.engine_for(name, features) or [registry.GENERAL]
     for engine in engines:

@@ -18,7 +18,7 @@ from stochfuse.engines.contact_sample import sample_optimum
 from stochfuse.engines.events import events, relabellings
 from stochfuse.engines.monte_carlo import Experiment, Sample, sample
 from stochfuse.errors import UsageError
-from stochfuse.estimators.making import make
+from stochfuse.estimators.making import kinds_of, make
 from stochfuse.estimators.protocol import Claims, Estimator
 from stochfuse.estimators.world import claimed_only, moments
 from stochfuse.kalman.metrics import Metric, Moments
@@ -131,7 +131,7 @@ def sampled(system: System, links: LinkRows, how: Settings, *, errors: bool = Fa
         If runs, seed or workers are out of range.
     """
     _check(system, links, how)
-    network, kinds = system.network, system.labels
+    network, kinds = system.network, kinds_of(system, how.estimator)
     permutations = relabellings(network, links, kinds)
     groups = groups_alike(network, links, kinds, permutations)
     if how.estimator == OPTIMAL and network.agents > FEW:
@@ -203,7 +203,8 @@ def _drawn(
     )
     workers = how.workers
     if workers is None:
-        workers = len(os.sched_getaffinity(0)) if how.runs * rows >= MANY else 1
+        many = how.runs * rows >= MANY and getattr(how.estimator, "travels", True)
+        workers = len(os.sched_getaffinity(0)) if many else 1
     return sample(experiment, rows, workers=workers)
 
 
