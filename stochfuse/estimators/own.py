@@ -88,7 +88,7 @@ class OwnFusion(RecursiveEstimator):
         """Fuse a batch: the numbers themselves where there are data, else by weights."""
         P = np.stack([each.P for each in rests_on], axis=1)
         x = None if rests_on[0].x is None else np.stack(np.broadcast_arrays(*(e.x for e in rests_on)), axis=1)
-        if self.readings is not None:
+        if self.readings is not None and x is not None:
             return Worked(*reversed(self._all(x, P)))
         weighed = self._weighed(P)
         if P.shape[1] > 2 and not self.ordered:
