@@ -64,8 +64,8 @@ def compare(
     estimator: Annotated[
         str | None,
         option(
-            "Compare these estimators instead (stochfuse methods; or your own, module:Class), claims beside truth; "
-            "all: those that the scenario takes. One, with --methods: what these average.",
+            "Compare estimators instead (stochfuse methods, or your own module:Class), claims beside truth; all: those "
+            "that the scenario takes. One, with --methods: what these average.",
             WORK,
             metavar="LIST",
             autocompletion=completed((*ESTIMATORS, ALL)),

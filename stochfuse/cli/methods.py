@@ -17,7 +17,7 @@ from stochfuse.cli.options import (
 from stochfuse.scenario.own_rules import OwnRule
 from stochfuse.scenario.registry import LFG
 
-EXAMPLES = ("stochfuse methods", "stochfuse methods --matrix", "stochfuse methods --matrix --estimator my_rules:Mine")
+EXAMPLES = ("stochfuse methods", "stochfuse methods --matrix")
 
 
 def methods(

@@ -123,8 +123,7 @@ def _one_named(text: str | None) -> str | None:
 EstimatorOption = Annotated[
     str | None,
     option(
-        "What the agents do with what arrives (stochfuse methods), or a rule of your own, module:Class, of a file in "
-        "this folder or installed; default: local-fusion-graph.",
+        "One of stochfuse methods, or module:Class (in this folder too); default: local-fusion-graph.",
         WORK, metavar="NAME", callback=_one_named, autocompletion=completed(ESTIMATORS),
     ),
 ]  # fmt: skip

@@ -49,6 +49,10 @@ EstimatorsOption = Annotated[
         autocompletion=completed(ESTIMATORS),
     ),
 ]
+CaseOption = Annotated[
+    str | None,
+    option("Arrivals are drawn from the links of this case.", NETWORK + RARE, metavar="NAME"),
+]
 CriterionOption = Annotated[
     str,
     option(
@@ -84,6 +88,7 @@ def run(
     ] = None,
     changes: Changes = Changes(),
     seed: Annotated[int, option("Of arrivals that are drawn; default: 1.", NETWORK, min=0, metavar="N")] = 1,
+    case: CaseOption = None,
     estimator: EstimatorsOption = None,
     criterion: CriterionOption = "det",
     metric: MetricOption = None,
@@ -118,7 +123,7 @@ def run(
     first = initial or beside(measurements)
     records = read_records(given, measurements, arrivals, truth, first, pairs("--columns", columns))
     chosen = metric_of(metric or given.metric or "trace", given.model)
-    way = Way(names or (given.estimator or LFG,), one_link(links), seed, criterion)
+    way = Way(names or (given.estimator or LFG,), one_link(links, case), seed, criterion)
     writing: Any = nullcontext()
     if output is not None:
         writing = EstimatesFile(output, records.scenario, truth=truth is not None, covariance=covariance)
@@ -144,8 +149,12 @@ def show(found: RunResult, format: str | None, plot: Path | None, digits: int) -
     write_report(report, chosen_format(format, None), None)
 
 
-def one_link(links: list[float] | None) -> float | None:
-    """Return the one link probability that was asked for, if any."""
+def one_link(links: list[float] | None, case: str | None = None) -> float | str | None:
+    """Return the one link probability, or the case of the scenario, that was asked for, if any."""
+    if case is not None and links is not None:
+        raise UsageError("--case: expected no --link beside it, got both")
+    if case is not None:
+        return case
     if links is not None and len(links) > 1:
         raise UsageError(f"--link: expected one link probability, got {len(links)}")
     return None if links is None else links[0]

@@ -21,7 +21,7 @@ from stochfuse.cli.options import (
     named,
     option,
 )
-from stochfuse.cli.run import CriterionOption, EstimatorsOption, one_link, show
+from stochfuse.cli.run import CaseOption, CriterionOption, EstimatorsOption, one_link, show
 from stochfuse.errors import UsageError
 from stochfuse.scenario.registry import LFG
 
@@ -36,6 +36,7 @@ def simulate(
     changes: Changes = Changes(),
     runs: Annotated[int, option("Independent runs; default: 1.", WORK, min=1, metavar="N")] = 1,
     seed: Annotated[int, option("Of all random numbers; default: 1.", WORK, min=0, metavar="N")] = 1,
+    case: CaseOption = None,
     estimator: EstimatorsOption = None,
     criterion: CriterionOption = "det",
     metric: MetricOption = None,
@@ -65,7 +66,7 @@ def simulate(
     given, links = changes.of(scenario)
     way = {
         "estimator": names or (given.estimator or LFG,),
-        "link": one_link(links),
+        "link": one_link(links, case),
         "seed": seed,
         "criterion": criterion,
     }

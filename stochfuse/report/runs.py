@@ -154,8 +154,13 @@ def run_json(found: RunResult) -> dict[str, Any]:
 def draw(found: RunResult) -> Any:
     """Return the figure: error and ±2σ of every agent over the steps, below it what arrived, and NEES with its band.
 
-    Without a truth: estimates in the place of errors, and NIS in that of NEES.
+    Without a truth: estimates in the place of errors, and NIS in that of NEES.  Of an inertial navigation system: its
+    position instead, see `stochfuse.report.navigation`.
     """
+    if "navigation" in found.scenario.source and not np.isnan(found.traces[0].truth).any():
+        from stochfuse.report.navigation import draw_navigation
+
+        return draw_navigation(found, _titles(found)[:2])
     n = found.scenario.network.agents
     agents = range(min(n, MOST_AGENTS))
     columns = min(len(agents), 3)
@@ -173,7 +178,7 @@ def draw(found: RunResult) -> Any:
         handles = handles or lines
         _arrived(figure.add_subplot(grid[row + 1, column], sharex=above), found, agent)
     if checked:
-        _averages(figure.add_subplot(grid[len(heights) - 1, :]), found, "NEES" if known else "NIS")
+        averages(figure.add_subplot(grid[len(heights) - 1, :]), found, "NEES" if known else "NIS")
     below(figure, handles)
     what = f"of the first of {found.runs:,} runs" if found.runs > 1 else "of the run"
     shown = "errors" if known else "estimates, since the truth is not known,"
@@ -227,7 +232,7 @@ def _arrived(axes: Any, found: RunResult, agent: int) -> None:
     axes.xaxis.get_major_locator().set_params(integer=True)
 
 
-def _averages(axes: Any, found: RunResult, name: str) -> None:
+def averages(axes: Any, found: RunResult, name: str) -> None:
     """Averages of NEES or NIS over runs and agents, with what they keep if the agents of a run are one."""
     k = np.arange(1, found.scenario.network.steps + 1)
     each = [(trace.nees, trace.band) if name == "NEES" else (trace.nis, trace.nis_band) for trace in found.traces]
