@@ -7,8 +7,8 @@
 
 The truth begins at the scenario's initial.x (or where its nominal path does), first estimates lie about it; of what
 a parallel filter has beside its output (a slip, an offset) the estimate begins at 0, and the truth lies about it.
-Sensors look when the scenario says that they do, about its nominal path; what they show is the true function of the true
-state.
+Sensors look when the scenario says that they do, about its nominal path; what they show is the true function of the
+true state.
 
 Every run has streams of random numbers of its own, so that it depends on the seed and its number alone.
 """

@@ -218,7 +218,7 @@ def _linear(check: Checker, path: str, pair: Mapping[str, Any], d: int) -> Relat
 
 def _noise(check: Checker, path: str, table: Mapping[str, Any]) -> _Noise | None:
     noise = _Noise(*(_deviation(check, f"{path}.{key}", table.get(key)) for key in _Noise._fields))
-    return None if noise == (None, None) else noise
+    return noise if any(sigma is not None for sigma in noise) else None
 
 
 def _deviation(check: Checker, path: str, value: Any) -> float | None:
