@@ -37,7 +37,7 @@ import numpy as np
 
 from stochfuse.estimators.recursion import FusionStep, RecursiveEstimator, RuleError, Worked
 from stochfuse.estimators.world import World
-from stochfuse.kalman.checks import covariance_fault, size
+from stochfuse.kalman.checks import covariance_fault, shown, size
 from stochfuse.scenario.own_rules import OwnRule
 
 TOGETHER = "own rule"
@@ -140,7 +140,7 @@ class OwnFusion(RecursiveEstimator):
         scaled = K.sum(axis=1) * unit[:, None, :] / unit[:, :, None]
         wrong = (np.abs(scaled - np.eye(K.shape[-1])) > LINEAR).any(axis=(1, 2))
         if wrong.any():
-            total = np.round(K.sum(axis=1)[wrong.argmax()], 6).tolist()
+            total = shown(np.round(K.sum(axis=1)[wrong.argmax()], 6))
             raise RuleError(
                 f"{self.name}: expected weights with Σ K_i = I, got {total}: the error would hold the state itself",
                 int(wrong.argmax()),
