@@ -121,15 +121,15 @@ def _states(
     turned: tuple[int, ...] = ()
     if table.get("attitude") is not None:
         count = 1 if len(place) == 2 else 3
-        what = f"the name{'s' * (count > 1)} of the {count} state{'s' * (count > 1)} that turn the agent's frame"
-        turned = _named(check, table, "attitude", states, (count,), what)
+        what = "the name of the state that turns" if count == 1 else "the names of the 3 states that turn"
+        turned = _named(check, table, "attitude", states, (count,), f"{what} an agent's frame")
         if not any(noise.direction for noise in measured):
             check.note("cooperative.attitude", "a direction that is measured in that frame", "none")
     clock: tuple[int, ...] = ()
     if any(noise.time for noise in measured) or table.get("clock") is not None:
         one = {"clock": [table["clock"]] if table.get("clock") is not None else None}
         clock = _named(check, one, "clock", states, (1,), "the name of the state that is the clock's error")
-        if not any(noise.time for noise in measured):
+        if not any(noise.time for noise in measured) and table.get("time") is None:
             check.note("cooperative.clock", "a time that is measured", "none")
     return None if len(check.problems) > before else _States(place, turned, clock, len(states))
 

@@ -643,6 +643,7 @@ def test_without_a_table_there_is_nothing():
 
 
 GOOD = {"positions": ["x", "y"], "range": 2.0}
+LINEAR = {"agents": [1, 2], "H_i": [[1, 0, 0]], "H_j": [[0, 0, 2]], "R": 3.0}
 DEVIATION = "expected a positive standard deviation"
 
 
@@ -704,10 +705,65 @@ DEVIATION = "expected a positive standard deviation"
             {"pair": [{"agents": [1, 2], "range": 1.0}, {"agents": [2, 1], "none": True}]},
             "cooperative.pair[2].agents: expected every pair once, got [2, 1] again",
         ),
+        (
+            {"attitude": ["vx"]},
+            "cooperative.attitude: expected a direction that is measured in that frame, got none",
+        ),
+        (
+            {"attitude": ["vx", "x", "y"], "direction": 0.1},
+            "cooperative.attitude: expected the name of the state that turns an agent's frame, got ['vx', 'x', 'y']",
+        ),
+        (
+            {"attitude": ["h"], "direction": 0.1},
+            'cooperative.attitude[1]: expected one of "x", "vx", "y", got \'h\'',
+        ),
+        ({"time": 1.0}, "cooperative.clock: expected the name of the state that is the clock's error, got nothing"),
+        ({"clock": "vx"}, "cooperative.clock: expected a time that is measured, got none"),
+        ({"time": -1.0, "clock": "vx"}, f"cooperative.time: {DEVIATION}, got -1.0"),
+        (
+            {"pair": [{**LINEAR, "range": 1.0}]},
+            "cooperative.pair[1]: expected either H_i, H_j and R or another measurement, got both",
+        ),
+        (
+            {"pair": [{**LINEAR, "H_j": [[1, 0]]}]},
+            "cooperative.pair[1].H_j: expected a matrix of 1 row (of R) and 3 columns (of the states), got [[1, 0]]",
+        ),
+        ({"pair": [{**LINEAR, "R": [[-1.0]]}]}, "cooperative.pair[1].R: expected a covariance, got [[-1.0]]"),
     ],
 )
 def test_reading_names_what_is_wrong_in_the_table(changes, problem):
     assert read({**GOOD, **changes})[1] == [problem]
+
+
+def test_clocks_and_linear_relations_need_no_places():
+    relations, problems = read({"clock": "vx", "time": 0.5, "pair": [LINEAR]}, nodes=None)
+    assert (relations.positions, problems) == ((), [])
+    for pair, expected in (
+        ((0, 1), ([[1, 0, 0]], [[0, 0, 2]], [[3]])),
+        ((2, 1), ([[0, 1, 0]], [[0, -1, 0]], [[0.25]])),
+    ):
+        for M, of in zip(relations.pairs[pair], expected, strict=True):
+            np.testing.assert_array_equal(M, of)
+    assert len(relations.pairs) == 6
+    assert read({**GOOD, "pair": [{"agents": [1, 2], "H_i": [[1, 0, 0]], "R": 1.0}]})[1] == [
+        "cooperative.pair[1].H_j: expected a matrix beside the others of H_i, H_j and R, got nothing"
+    ]
+
+
+def test_small_angles_in_space_turn_what_is_seen():
+    states = ("x", "y", "z", "a", "b", "c")
+    table = {"positions": ["x", "y", "z"], "attitude": ["a", "b", "c"], "direction": 0.1}
+    nodes = [{"position": [0, 0, 0]}, {"position": [3, 4, 12]}]
+    relations, problems = read(table, nodes, 2, states=states)
+    assert not problems
+    H_i, H_j, _ = relations.pairs[0, 1]
+    # to turn about the line of sight is not seen; about anything else as far as the line of sight goes round
+    np.testing.assert_allclose(H_i[:, 3:] @ [3, 4, 12], 0, atol=1e-12)
+    assert np.linalg.norm(H_i[:, 3:] @ np.array([4, -3, 0]) / 5) == pytest.approx(1.0)
+    # turned left by φ, what moves left by distance times φ stays where it is seen
+    left = np.cross([0, 0, 1], [3, 4, 12])
+    np.testing.assert_allclose(H_i[:, 3:] @ [0, 0, 1] + H_j[:, :3] @ left, 0, atol=1e-12)
+    np.testing.assert_array_equal(H_j[:, 3:], 0)
 
 
 @pytest.mark.parametrize(
