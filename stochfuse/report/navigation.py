@@ -9,7 +9,7 @@ Longitude is counted from the start of the way.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,6 @@ from stochfuse.fusion.inertial import POSITION
 from stochfuse.fusion.trajectory import displaced, geodetic
 from stochfuse.kalman.kernel import at_step
 from stochfuse.report.plot import COLORS, DASHES, below, figure_class, titled
-from stochfuse.report.runs import averages
 from stochfuse.scenario.checker import Checker
 from stochfuse.scenario.navigation import read_navigation
 
@@ -27,8 +26,14 @@ LINES = ("latitude [°]", "longitude from the start [°]", "height [m]")
 AXES = ("north", "east", "down")
 
 
-def draw_navigation(found: RunResult, title: Sequence[str]) -> Any:
-    """Return the figure: latitude, longitude, height over time, below them errors along north, east, down, and NEES."""
+def draw_navigation(found: RunResult, title: Sequence[str], averages: Callable[[Any, RunResult, str], None]) -> Any:
+    """Return the figure: latitude, longitude, height over time, below them errors along north, east, down, and NEES.
+
+    Parameters
+    ----------
+    title : its first lines.
+    averages : draws NEES on axes.
+    """
     steps, network = found.scenario.network.steps, found.scenario.network
     errors = read_navigation(Checker(), found.scenario.source["navigation"], steps)
     if errors is None:

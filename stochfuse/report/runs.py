@@ -160,7 +160,7 @@ def draw(found: RunResult) -> Any:
     if "navigation" in found.scenario.source and not np.isnan(found.traces[0].truth).any():
         from stochfuse.report.navigation import draw_navigation
 
-        return draw_navigation(found, _titles(found)[:2])
+        return draw_navigation(found, _titles(found)[:2], _averages)
     n = found.scenario.network.agents
     agents = range(min(n, MOST_AGENTS))
     columns = min(len(agents), 3)
@@ -178,7 +178,7 @@ def draw(found: RunResult) -> Any:
         handles = handles or lines
         _arrived(figure.add_subplot(grid[row + 1, column], sharex=above), found, agent)
     if checked:
-        averages(figure.add_subplot(grid[len(heights) - 1, :]), found, "NEES" if known else "NIS")
+        _averages(figure.add_subplot(grid[len(heights) - 1, :]), found, "NEES" if known else "NIS")
     below(figure, handles)
     what = f"of the first of {found.runs:,} runs" if found.runs > 1 else "of the run"
     shown = "errors" if known else "estimates, since the truth is not known,"
@@ -232,7 +232,7 @@ def _arrived(axes: Any, found: RunResult, agent: int) -> None:
     axes.xaxis.get_major_locator().set_params(integer=True)
 
 
-def averages(axes: Any, found: RunResult, name: str) -> None:
+def _averages(axes: Any, found: RunResult, name: str) -> None:
     """Averages of NEES or NIS over runs and agents, with what they keep if the agents of a run are one."""
     k = np.arange(1, found.scenario.network.steps + 1)
     each = [(trace.nees, trace.band) if name == "NEES" else (trace.nis, trace.nis_band) for trace in found.traces]
