@@ -337,7 +337,8 @@ class PastNumbers:
         rests_on = np.array([pasts.rests_on[value] for value in values.tolist()], dtype=np.int64)
         before = [self._gathered(column * self.pairs.runs + runs) for column in rests_on.reshape(len(keys), -1).T]
         estimator.readings = self.readings.of(runs)
-        worked = worked_out(estimator, pasts.step[values[0]], values, before)
+        rules = [pasts.rule[value] for value in values.tolist()]
+        worked = worked_out(estimator, pasts.step[values[0]], rules, before, values)
         self._add(keys, Worked(*(None if a is None else np.broadcast_to(a, (len(keys), *a.shape[1:])) for a in worked)))
 
     def _add(self, keys: np.ndarray, worked: Worked) -> None:

@@ -269,12 +269,12 @@ class PastClaims:
         self._batch = np.zeros(len(estimator.pasts.step), dtype=int)
         self._row = np.zeros(len(estimator.pasts.step), dtype=int)
         steps: list[int] = []
-        for step, numbers in estimator.pasts.batches(estimator.mixed):
+        for step, rules, numbers in estimator.pasts.batches(estimator.mixed):
             if steps and step > steps[-1] and estimator.readings is None:
                 self._settle([b for b, s in enumerate(steps) if s == step - 2])
             steps.append(step)
             rests_on = np.array([estimator.pasts.rests_on[n] for n in numbers], dtype=int).reshape(len(numbers), -1)
-            worked = worked_out(estimator, step, numbers, [self._gathered(column) for column in rests_on.T])
+            worked = worked_out(estimator, step, rules, [self._gathered(column) for column in rests_on.T], numbers)
             self._batch[numbers], self._row[numbers] = len(self._worked), np.arange(len(numbers))
             self._worked.append(worked)
         if estimator.readings is None:
@@ -337,14 +337,19 @@ class RuleError(Exception):
         self.item = item
 
 
-def worked_out(estimator: RecursiveEstimator, step: int, numbers: np.ndarray, rests_on: list[Worked]) -> Worked:
-    """Work a batch of pasts out, and see that covariances come of it."""
+def worked_out(
+    estimator: RecursiveEstimator,
+    step: int,
+    rules: Sequence[FusionStep],
+    rests_on: list[Worked],
+    numbers: Sequence[int] | np.ndarray = (),
+) -> Worked:
+    """Work a batch out, and see that covariances come of it; with the pasts' numbers, errors name an agent."""
     mend = "expected noises R that are not negligible beside the errors P, in units in which P is not far from 1"
-    rules = [estimator.pasts.rule[number] for number in numbers.tolist()]
     try:
         worked = estimator.batch(step, rules, rests_on)
     except RuleError as error:
-        agent = estimator.pasts.agent_of.get(int(numbers[error.item]))
+        agent = estimator.pasts.agent_of.get(int(numbers[error.item])) if len(numbers) else None
         whose = "" if agent is None else f", agent {agent + 1}"
         raise UsageError(f"step {step}{whose}: estimator {error}") from None
     except np.linalg.LinAlgError:
@@ -412,7 +417,7 @@ class Pasts(Renamed):
                 into.agent_of.setdefault(new, names[self.agent_of[value]])
         return new
 
-    def batches(self, mixed: Sequence[str]) -> Iterator[tuple[int, np.ndarray]]:
+    def batches(self, mixed: Sequence[str]) -> Iterator[tuple[int, list[FusionStep], np.ndarray]]:
         """Pasts of one step and rule that rest on as many others, and on none of their own batch; in order of time.
 
         Parameters
@@ -426,4 +431,4 @@ class Pasts(Renamed):
             what = rule[:1] if rule[0] in mixed else rule
             found.setdefault((step, level[number], what, len(rests_on)), []).append(number)
         for key in sorted(found, key=lambda key: key[:2]):
-            yield key[0], np.array(found[key])
+            yield key[0], [self.rule[number] for number in found[key]], np.array(found[key])
