@@ -323,12 +323,12 @@ def _filled(parts: Sequence[Any], batches: np.ndarray, batch: np.ndarray, row: n
     return out
 
 
-class RuleError(Exception):
-    """What a fusion rule does that it must not.
+class RuleError(UsageError):
+    """What a fusion rule of one's own does that it must not.
 
     Parameters
     ----------
-    why : without step and agent.
+    why : what it is.
     item : place of the fusion in its batch.
     """
 
@@ -351,7 +351,7 @@ def worked_out(
     except RuleError as error:
         agent = estimator.pasts.agent_of.get(int(numbers[error.item])) if len(numbers) else None
         whose = "" if agent is None else f", agent {agent + 1}"
-        raise UsageError(f"step {step}{whose}: estimator {error}") from None
+        raise RuleError(f"step {step}{whose}: estimator {error}", error.item) from None
     except np.linalg.LinAlgError:
         raise UsageError(f"step {step}: the covariance of an innovation is singular: {mend}") from None
     variances = np.diagonal(worked.P, axis1=-2, axis2=-1)
