@@ -119,9 +119,7 @@ class OwnFusion(RecursiveEstimator):
             one = slice(column, column + 1)
             alone = self._all(unit[:1, None, :, None] * some[..., one], P[:1])
             if not _alike(alone[1][0], fused[0], LINEAR):
-                raise RuleError(
-                    f"{self.name}: expected a P that depends on the P_i alone, got another for other x; {DATA_ALONE}"
-                )
+                raise RuleError(f"expected a P that depends on the P_i alone, got another for other x; {DATA_ALONE}")
             if self.errors:
                 self._check_weights(K[:1], alone[0], some[..., one], unit[:1])
         return Weighed(K, fused)
@@ -133,7 +131,7 @@ class OwnFusion(RecursiveEstimator):
         wrong = (away > LINEAR * sizes).any(axis=(1, 2))
         if wrong.any():
             raise RuleError(
-                f"{self.name}: the actual error is known of a fused x that is a sum Σ K_i x_i of weights that depend "
+                f"the actual error is known of a fused x that is a sum Σ K_i x_i of weights that depend "
                 f"on the P_i alone, got none; {DATA_ALONE}",
                 int(wrong.argmax()),
             )
@@ -142,7 +140,7 @@ class OwnFusion(RecursiveEstimator):
         if wrong.any():
             total = shown(np.round(K.sum(axis=1)[wrong.argmax()], 6))
             raise RuleError(
-                f"{self.name}: expected weights with Σ K_i = I, got {total}: the error would hold the state itself",
+                f"expected weights with Σ K_i = I, got {total}: the error would hold the state itself",
                 int(wrong.argmax()),
             )
 
@@ -152,7 +150,7 @@ class OwnFusion(RecursiveEstimator):
         back = np.concatenate([other.K[0, :1], other.K[0, :0:-1]])
         if not _alike(other.P[0], weighed.P[0], SAME) or (self.errors and not _alike(back, weighed.K[0], SAME)):
             raise RuleError(
-                f"{self.name}: its result depends on the order of those heard; say so by ordered = True, which tells "
+                "its result depends on the order of those heard; say so by ordered = True, which tells "
                 "agents apart and takes longer"
             )
 
@@ -168,9 +166,9 @@ class OwnFusion(RecursiveEstimator):
         for item in () if fine else range(items):
             fault = covariance_fault(found[1][item])
             if fault is not None:
-                raise RuleError(f"{self.name}: expected a fused P that is a covariance, got {fault}", item)
+                raise RuleError(f"expected a fused P that is a covariance, got {fault}", item)
             if not np.isfinite(found[0][item]).all():
-                raise RuleError(f"{self.name}: expected a fused x, got values that are not finite", item)
+                raise RuleError("expected a fused x, got values that are not finite", item)
         return found[0], 0.5 * (found[1] + np.swapaxes(found[1], -1, -2))
 
     def _called(
@@ -184,19 +182,19 @@ class OwnFusion(RecursiveEstimator):
             with np.errstate(all="ignore"):
                 found = self.rule.fuse(*own)
         except Exception as error:
-            raise RuleError(f"{self.name}: {self._told(error)}", item) from None
+            raise RuleError(self._told(error), item) from None
         if not (np.array_equal(own[0], x) and np.array_equal(own[1], P)):
-            raise RuleError(f"{self.name}: changes its inputs in place", item)
+            raise RuleError("changes its inputs in place", item)
         if not isinstance(found, tuple | list) or len(found) != 2:
-            raise RuleError(f"{self.name}: {expected}, got {type(found).__name__}", item)
+            raise RuleError(f"{expected}, got {type(found).__name__}", item)
         try:
             arrays = [np.asarray(each) for each in found]
         except ValueError:
-            raise RuleError(f"{self.name}: {expected}, got what is no array", item) from None
+            raise RuleError(f"{expected}, got what is no array", item) from None
         for array, shape in zip(arrays, shapes, strict=True):
             if array.dtype.kind not in "fiu" or array.shape != shape:
                 got = size(array.shape) or "a number" if array.dtype.kind in "fiu" else f"{array.dtype} numbers"
-                raise RuleError(f"{self.name}: {expected}, got {got}", item)
+                raise RuleError(f"{expected}, got {got}", item)
         return arrays[0].astype(float), arrays[1].astype(float)
 
     def _told(self, error: Exception) -> str:

@@ -351,7 +351,8 @@ def worked_out(
     except RuleError as error:
         agent = estimator.pasts.agent_of.get(int(numbers[error.item])) if len(numbers) else None
         whose = "" if agent is None else f", agent {agent + 1}"
-        raise RuleError(f"step {step}{whose}: estimator {error}", error.item) from None
+        name = getattr(estimator, "name", "of one's own")
+        raise RuleError(f"estimator {name}: step {step}{whose}: {error}", error.item) from None
     except np.linalg.LinAlgError:
         raise UsageError(f"step {step}: the covariance of an innovation is singular: {mend}") from None
     variances = np.diagonal(worked.P, axis1=-2, axis2=-1)

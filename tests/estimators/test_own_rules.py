@@ -257,7 +257,7 @@ def test_rubbish_is_named_with_step_and_agent(what):
     scenario = {**SMALL, "network": {**SMALL["network"], "steps": 2}}
     if what == "order":  # of more than two
         scenario = {**SMALL, "network": {"agents": 3, "steps": 2, "link": 1.0}}
-    with pytest.raises(sf.UsageError, match=rf"^step [12], agent \d: estimator mine: .*{why}") as error:
+    with pytest.raises(sf.UsageError, match=rf"^estimator mine: step [12], agent \d: .*{why}") as error:
         sf.predict(scenario, None, "general", "actual", estimator=rule_of(fuse))
     assert "\n" not in str(error.value)
 
@@ -266,7 +266,7 @@ def test_rubbish_of_the_second_step_names_it():
     def late(x, P):
         return (x[0], P[0]) if P[0, 0, 0] == 9 else (x[0], -P[0])
 
-    with pytest.raises(sf.UsageError, match=r"^step 2, agent 1: estimator mine: .* got a variance of -"):
+    with pytest.raises(sf.UsageError, match=r"^estimator mine: step 2, agent 1: .* got a variance of -"):
         sf.predict(SMALL, None, "monte-carlo", estimator=rule_of(late), runs=5)
 
 
