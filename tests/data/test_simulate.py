@@ -183,7 +183,7 @@ def test_what_only_a_filter_of_its_own_knows_is_wrong_at_first_as_it_claims():
         key: value for key, value in sf.load_scenario("parallel-filters").to_mapping().items() if key != "network"
     }
     source["network"] = {"agents": 3, "steps": 8, "hears": [[2, 3], [], []], "link": 0.5}
-    assert worst_z(sf.load_scenario(source), "joint-blender", 2000) < 4.5
+    assert worst_z(sf.load_scenario(source), "joint-blender", 800) < 4.5
 
 
 def test_a_case_of_the_scenario_is_simulated_by_its_name(tmp_path):
