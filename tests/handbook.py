@@ -35,6 +35,7 @@ CHAPTERS = {
     "Message load": "questions.messages",
     "Covariance intersection": "fusion.intersection",
     "Parallel filters and blenders": "fusion.parallel",
+    "A fusion rule of one's own": "estimators.own",
     "The equivalent measurement": "fusion.equivalent",
     "Cooperative estimators": "fusion.cooperative",
     "Models by name": "scenario.motion",

@@ -24,6 +24,7 @@ from stochfuse.cli.options import (
     Written,
     check_memory,
     completed,
+    named,
     option,
     quantity_names,
     settings_for,
@@ -64,8 +65,8 @@ def compare(
     estimator: Annotated[
         str | None,
         option(
-            "Compare these estimators instead (stochfuse methods), claims beside truth; all: those that the scenario "
-            "takes. One, with --methods: what these average.",
+            "Compare estimators instead (stochfuse methods, or your own module:Class), claims beside truth; all: those "
+            "that the scenario takes. One, with --methods: what these average.",
             WORK,
             metavar="LIST",
             autocompletion=completed((*ESTIMATORS, ALL)),
@@ -103,7 +104,7 @@ def compare(
     swept = changes.over(over, given)
     given = swept.longest if swept else given
     check_memory(given, links, to.kind, len(swept.points) if swept else 1)
-    names = None if estimator is None else _names(estimator)
+    names = None if estimator is None else [ALL] if estimator == ALL else list(named(estimator))
     if names is None and methods is None and given.estimator is not None:
         names = [ALL]  # a scenario for other estimators than those of the thesis' methods
     several = names is not None and (len(names) > 1 or methods is None or names == [ALL])
@@ -113,7 +114,7 @@ def compare(
     criterion = weighing.criterion
     settings = settings_for(
         [GENERAL, MONTE_CARLO] if several and methods is None else ways,
-        estimator=None if several or names is None else _known(names[0]),
+        estimator=None if several or names is None else names[0],
         **sampling._asdict(),
         **precisely._asdict(),
         **graphs._asdict(),
@@ -143,13 +144,6 @@ def compare(
 
 def _names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",")]
-
-
-def _known(estimator: str) -> str:
-    from stochfuse.prediction.predict import choose
-
-    choose("estimator", estimator, ESTIMATORS)
-    return estimator
 
 
 class _Shown(NamedTuple):

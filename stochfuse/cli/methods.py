@@ -4,13 +4,27 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from stochfuse.cli.options import SHOWN, FormatOption, OutputOption, check_files, chosen_format, option, write_report
+from stochfuse.cli.options import (
+    SHOWN,
+    FormatOption,
+    OutputOption,
+    check_files,
+    chosen_format,
+    named,
+    option,
+    write_report,
+)
+from stochfuse.scenario.own_rules import OwnRule
+from stochfuse.scenario.registry import LFG
 
 EXAMPLES = ("stochfuse methods", "stochfuse methods --matrix")
 
 
 def methods(
     matrix: Annotated[bool, option("Which estimator takes what, by which engine.", SHOWN, "--matrix")] = False,
+    estimator: Annotated[
+        str | None, option("Also this rule of your own, module:Class; several: a,b.", SHOWN, metavar="LIST")
+    ] = None,
     format: FormatOption = None,
     output: OutputOption = None,
 ) -> None:
@@ -21,4 +35,5 @@ def methods(
     from stochfuse.report.methods import methods_report
 
     check_files(output, None)
-    write_report(methods_report(matrix), chosen_format(format, output), output)
+    own = [name for name in named(estimator or LFG) if isinstance(name, OwnRule)]
+    write_report(methods_report(matrix, own), chosen_format(format, output), output)

@@ -20,6 +20,7 @@ import typer
 from stochfuse.cli.progress import quiet
 from stochfuse.errors import UsageError, nearest
 from stochfuse.scenario import registry
+from stochfuse.scenario.own_rules import estimators_named
 from stochfuse.scenario.registry import (
     CONTROLS,
     CRITERIA,
@@ -109,10 +110,33 @@ WorkersOption = Annotated[
     int | None, option("monte-carlo: processes; default: by the size of the sample.", WORK + RARE, min=1, metavar="N")
 ]
 ArchitectureName = Annotated[str, choice(ARCHITECTURES, f"Who may hear whom: {', '.join(ARCHITECTURES)}.", NETWORK)]
+
+
+def named(text: str) -> tuple[str, ...]:
+    """Return the estimators of `naive` or `naive,my_rules:Mine`; modules are looked for in the working folder too.
+
+    Raises
+    ------
+    UsageError
+        If one is unknown or named twice.
+    """
+    try:
+        return estimators_named([name.strip() for name in text.split(",")], here=True)
+    except UsageError as error:
+        raise UsageError(f"--{error}") from None
+
+
+def _one_named(text: str | None) -> str | None:
+    return None if text is None else named(text.replace(",", " "))[0]
+
+
 EstimatorOption = Annotated[
     str | None,
-    choice(ESTIMATORS, "What the agents do with what arrives (stochfuse methods); default: local-fusion-graph.", WORK),
-]
+    option(
+        "One of stochfuse methods, or module:Class (in this folder too); default: local-fusion-graph.",
+        WORK, metavar="NAME", callback=_one_named, autocompletion=completed(ESTIMATORS),
+    ),
+]  # fmt: skip
 MetricOption = Annotated[
     str | None,
     option(
@@ -420,26 +444,6 @@ def quantity_names(text: str) -> list[str]:
             raise UsageError(f"--quantity: expected one or several of {known}, got '{name}'{nearest(name, QUANTITIES)}")
     if len(set(names)) < len(names):
         raise UsageError(f"--quantity: expected different ones, got {text}")
-    return names
-
-
-def estimator_names(text: str) -> tuple[str, ...]:
-    """Return the estimators of `naive` or `naive,optimal`.
-
-    Raises
-    ------
-    UsageError
-        If one is unknown or named twice.
-    """
-    names = tuple(name.strip() for name in text.split(","))
-    for name in names:
-        if name not in ESTIMATORS:
-            known = ", ".join(ESTIMATORS)
-            raise UsageError(
-                f"--estimator: expected one or several of {known}, got '{name}'{nearest(name, ESTIMATORS)}"
-            )
-    if len(set(names)) < len(names):
-        raise UsageError(f"--estimator: expected different ones, got {text}")
     return names
 
 

@@ -23,7 +23,7 @@ from stochfuse.cli.options import (
     check_files,
     chosen_format,
     completed,
-    estimator_names,
+    named,
     option,
     pairs,
     write_report,
@@ -41,12 +41,17 @@ EXAMPLES = (
 EstimatorsOption = Annotated[
     str | None,
     option(
-        f"One or several: {', '.join(ESTIMATORS[:3])}, … (stochfuse methods); default: the scenario's, else {LFG}.",
+        f"One or several: {', '.join(ESTIMATORS[:3])}, … (stochfuse methods), or your own, module:Class; default: the "
+        f"scenario's, else {LFG}.",
         WORK,
         "--estimator",
         metavar="LIST",
         autocompletion=completed(ESTIMATORS),
     ),
+]
+CaseOption = Annotated[
+    str | None,
+    option("Arrivals are drawn from the links of this case.", NETWORK + RARE, metavar="NAME"),
 ]
 CriterionOption = Annotated[
     str,
@@ -83,6 +88,7 @@ def run(
     ] = None,
     changes: Changes = Changes(),
     seed: Annotated[int, option("Of arrivals that are drawn; default: 1.", NETWORK, min=0, metavar="N")] = 1,
+    case: CaseOption = None,
     estimator: EstimatorsOption = None,
     criterion: CriterionOption = "det",
     metric: MetricOption = None,
@@ -107,7 +113,7 @@ def run(
 
     if measurements is None:
         raise UsageError("--measurements: expected a file of measurements, got none")
-    names = None if estimator is None else estimator_names(estimator)
+    names = None if estimator is None else named(estimator)
     files = [file for file in (measurements, arrivals, truth, initial) if file is not None]
     if [*files, scenario].count("-") > 1:
         raise UsageError("expected at most one file on standard input, got - for several")
@@ -117,7 +123,7 @@ def run(
     first = initial or beside(measurements)
     records = read_records(given, measurements, arrivals, truth, first, pairs("--columns", columns))
     chosen = metric_of(metric or given.metric or "trace", given.model)
-    way = Way(names or (given.estimator or LFG,), one_link(links), seed, criterion)
+    way = Way(names or (given.estimator or LFG,), one_link(links, case), seed, criterion)
     writing: Any = nullcontext()
     if output is not None:
         writing = EstimatesFile(output, records.scenario, truth=truth is not None, covariance=covariance)
@@ -143,8 +149,12 @@ def show(found: RunResult, format: str | None, plot: Path | None, digits: int) -
     write_report(report, chosen_format(format, None), None)
 
 
-def one_link(links: list[float] | None) -> float | None:
-    """Return the one link probability that was asked for, if any."""
+def one_link(links: list[float] | None, case: str | None = None) -> float | str | None:
+    """Return the one link probability, or the case of the scenario, that was asked for, if any."""
+    if case is not None and links is not None:
+        raise UsageError("--case: expected no --link beside it, got both")
+    if case is not None:
+        return case
     if links is not None and len(links) > 1:
         raise UsageError(f"--link: expected one link probability, got {len(links)}")
     return None if links is None else links[0]

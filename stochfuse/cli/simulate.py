@@ -18,10 +18,10 @@ from stochfuse.cli.options import (
     PlotOption,
     ScenarioArgument,
     check_files,
-    estimator_names,
+    named,
     option,
 )
-from stochfuse.cli.run import CriterionOption, EstimatorsOption, one_link, show
+from stochfuse.cli.run import CaseOption, CriterionOption, EstimatorsOption, one_link, show
 from stochfuse.errors import UsageError
 from stochfuse.scenario.registry import LFG
 
@@ -36,6 +36,7 @@ def simulate(
     changes: Changes = Changes(),
     runs: Annotated[int, option("Independent runs; default: 1.", WORK, min=1, metavar="N")] = 1,
     seed: Annotated[int, option("Of all random numbers; default: 1.", WORK, min=0, metavar="N")] = 1,
+    case: CaseOption = None,
     estimator: EstimatorsOption = None,
     criterion: CriterionOption = "det",
     metric: MetricOption = None,
@@ -58,14 +59,14 @@ def simulate(
     """
     from stochfuse.data.simulate import simulate as simulated
 
-    names = None if estimator is None else estimator_names(estimator)
+    names = None if estimator is None else named(estimator)
     if output is not None and output.exists() and not output.is_dir():
         raise UsageError(f"--output: expected a folder, got the file {output}")
     check_files(None, plot, scenario)
     given, links = changes.of(scenario)
     way = {
         "estimator": names or (given.estimator or LFG,),
-        "link": one_link(links),
+        "link": one_link(links, case),
         "seed": seed,
         "criterion": criterion,
     }

@@ -32,7 +32,7 @@ from stochfuse.prediction.method import Shown
 from stochfuse.prediction.predict import predict
 from stochfuse.prediction.result import Prediction
 from stochfuse.scenario.network import LinkRows, stacked_rows
-from stochfuse.scenario.registry import ESTIMATORS, GENERAL, LFG, MONTE_CARLO
+from stochfuse.scenario.registry import BROADCAST_PRIOR, GENERAL, LFG, MONTE_CARLO
 from stochfuse.scenario.result import Result
 from stochfuse.scenario.scenario import Scenario, ScenarioLike, link_rows, load_scenario
 
@@ -152,7 +152,7 @@ def crosscheck(
     again = None
     unsaid = [f for f in _families(read, prediction, chosen)[0] if not knows(prediction, f)]
     if unsaid:
-        whose = prediction.estimator if prediction.estimator in ESTIMATORS else estimator or given.estimator or LFG
+        whose = prediction.estimator if prediction.estimator != BROADCAST_PRIOR else estimator or given.estimator or LFG
         kept = ("runs", "seed", "workers", "criterion", "control", "precision", "at_most", "shown")
         asked = {name: settings[name] for name in kept if name in settings}
         again = predict(given, rows, MONTE_CARLO, "actual", estimator=whose, exact_first=False, **asked)

@@ -5,8 +5,10 @@
     z_ij(k) = H_i x_i + H_j x_j + v_ij                      what agents with states of their own measure of each other
     x̂_i(1) = x_i(1) + e_i          e ~ N(b, P(k0))          one error for all where the start is shared
 
-The truth begins at the scenario's initial.x (or where its nominal path does), first estimates lie about it.  Sensors
-look when the scenario says that they do, about its nominal path; what they show is the true function of the true state.
+The truth begins at the scenario's initial.x (or where its nominal path does), first estimates lie about it; of what
+a parallel filter has beside its output (a slip, an offset) the estimate begins at 0, and the truth lies about it.
+Sensors look when the scenario says that they do, about its nominal path; what they show is the true function of the
+true state.
 
 Every run has streams of random numbers of its own, so that it depends on the seed and its number alone.
 """
@@ -161,8 +163,9 @@ class _Runs:
     def drawn(self) -> tuple[np.ndarray, list[np.ndarray], dict[tuple[int, int], np.ndarray], list[np.ndarray]]:
         """Truth, measurements, relations and first estimates."""
         world, steps = self.world, self.system.steps
-        x = np.broadcast_to(self.start, (len(self._normal), *self.start.shape[1:]))
-        error = self._noise(world.P0) + (0.0 if world.error is None else world.error)
+        noise = self._noise(world.P0)
+        x = np.broadcast_to(self.start, (len(self._normal), *self.start.shape[1:])) - self._hidden(noise)
+        error = noise + (0.0 if world.error is None else world.error)
         begun = [self._state(i, x + error) for i in range(world.agents)]
         truth, measured = [], []
         relations: dict[tuple[int, int], list[np.ndarray]] = {pair: [] for pair in world.relations}
@@ -178,6 +181,13 @@ class _Runs:
                 relations[pair].append((H_i @ own + H_j @ other + self._noise(R))[..., 0])
         z = [np.stack([now[i] for now in measured], axis=1) for i in range(world.agents)]
         return np.stack(truth, axis=1), z, {pair: np.stack(e, axis=1) for pair, e in relations.items()}, begun
+
+    def _hidden(self, error: np.ndarray) -> np.ndarray:
+        """Part of the first errors that no output M x + s of a filter shows: there it is the truth that is drawn."""
+        out = np.zeros_like(error)
+        for rows, M in zip(self.world.states, self.world.M or (), strict=False):
+            out[:, rows] = error[:, rows] - np.linalg.pinv(M) @ M @ error[:, rows]
+        return out
 
     def _measured(self, step: int, x: np.ndarray) -> list[np.ndarray]:
         """What every agent measures, NaN where its sensor does not look."""

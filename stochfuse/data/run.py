@@ -33,6 +33,7 @@ from stochfuse.kalman.metrics import metric as metric_of
 from stochfuse.prediction.predict import choose, predict
 from stochfuse.scenario import registry
 from stochfuse.scenario.network import LinkRows
+from stochfuse.scenario.own_rules import estimators_named
 from stochfuse.scenario.result import Result
 from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario
 
@@ -149,6 +150,7 @@ class RunResult(Result):
     rows : one for each estimator and agent, and for the mean over the agents.
     traces : each estimator over the steps.
     heard : (steps, agents, agents) what arrived in the first run at once, receiver × sender, itself not counted.
+    measured : by agent, (steps, p) what it measured in the first run; NaN where nothing.
     notes : what the reader should know.
     suspicions : what may be wrong with the record, or with the scenario, where innovations are far from consistent; the
         one that explains most first.
@@ -161,6 +163,7 @@ class RunResult(Result):
     rows: tuple[Row, ...]
     traces: tuple[Trace, ...]
     heard: np.ndarray
+    measured: tuple[np.ndarray, ...]
     notes: tuple[str, ...] = ()
     simulated: bool = False
     suspicions: tuple[Suspicion, ...] = ()
@@ -192,7 +195,7 @@ class Way:
     Parameters
     ----------
     estimators : names.
-    link : link probability that arrivals are drawn with, in the place of the scenario's.
+    link : link probability that arrivals are drawn with, in the place of the scenario's, or the name of a case.
     seed : of drawn arrivals.
     criterion : what the weights of an intersection minimise.
     predicted : whether errors are predicted too.
@@ -200,11 +203,28 @@ class Way:
     """
 
     estimators: tuple[str, ...] = (registry.LFG,)
-    link: float | None = None
+    link: float | str | None = None
     seed: int = 1
     criterion: str = "det"
     predicted: bool = True
     suspected: bool = True
+
+
+def asked_links(scenario: Scenario, link: float | str | None) -> LinkRows:
+    """Return rows of a link probability, of a case by its name, or of the scenario's own links.
+
+    Raises
+    ------
+    UsageError
+        If it is no probability, or the scenario has no such case.
+    """
+    if not isinstance(link, str):
+        return link_rows(scenario, None if link is None else [link])
+    rows = link_rows(scenario)
+    if rows.names is None:
+        raise UsageError(f"case: expected a scenario with [[network.case]], got none with a case '{link}'")
+    choose("case", link, rows.names)
+    return rows.take(slice(rows.names.index(link), rows.names.index(link) + 1))
 
 
 def way_of(given: Mapping[str, Any], scenario: Scenario) -> Way:
@@ -223,10 +243,7 @@ def way_of(given: Mapping[str, Any], scenario: Scenario) -> Way:
             raise UsageError(f"{name}: no such setting{nearest(name, known)}; expected {', '.join(known)}")
     rest, asked = dict(given), given.get("estimator") or scenario.estimator or registry.LFG
     rest.pop("estimator", None)
-    names = (asked,) if isinstance(asked, str) else tuple(asked)
-    for name in names:
-        choose("estimator", name, registry.ESTIMATORS)
-    return Way(names, **rest)
+    return Way(estimators_named(asked), **rest)
 
 
 @of_scenario
@@ -300,20 +317,20 @@ def run_records(
     scenario = records.scenario
     links = None
     if not records.given or way.link is not None or scenario.network.link is not None or scenario.network.cases:
-        links = link_rows(scenario, None if way.link is None else [way.link])
+        links = asked_links(scenario, way.link)
     if not records.given and (links is None or (len(links.link) > 1)):
         raise UsageError(
             "arrivals are drawn from the scenario's links: expected one link probability; give --link or --arrivals"
         )
     tallies = {name: Tally(records, name, way.criterion) for name in way.estimators}
     done, total = 0, len(records.names) * len(way.estimators) * scenario.network.steps
-    heard, suspected = None, ()
+    heard, measured, suspected = None, (), ()
     for batch in records.batches():
         arrivals = batch.arrivals
         if arrivals is None:
             arrivals = drawn_arrivals(scenario.system, links, batch.missed, way.seed, int(batch.runs[0]))  # type: ignore[arg-type]
         if heard is None:
-            heard = _heard(arrivals)
+            heard, measured = _heard(arrivals), tuple(z[0] for z in batch.z)
             suspected = suspicions(scenario, batch, records.known) if way.suspected else ()
         for tally in tallies.values():
             tally.add(batch, arrivals, write, (done, total))
@@ -333,6 +350,7 @@ def run_records(
         tuple(rows),
         tuple(tally.trace() for tally in tallies.values()),
         heard,
+        measured,
         tuple(dict.fromkeys(notes)),
         suspicions=suspected,
     )

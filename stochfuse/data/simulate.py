@@ -17,12 +17,12 @@ import numpy as np
 
 from stochfuse.data.draw import drawn, drawn_arrivals
 from stochfuse.data.records import NUMBERS, Batch
-from stochfuse.data.run import RunResult, run_records, way_of
+from stochfuse.data.run import RunResult, asked_links, run_records, way_of
 from stochfuse.data.writing import ARRIVALS, ESTIMATES, FIRST, MEASUREMENTS, TRUTH, EstimatesFile, RecordFiles
 from stochfuse.errors import UsageError
 from stochfuse.kalman.metrics import metric as metric_of
 from stochfuse.scenario.network import LinkRows
-from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario
+from stochfuse.scenario.scenario import Scenario, of_scenario
 
 FILES = (MEASUREMENTS, ARRIVALS, TRUTH, FIRST, ESTIMATES)
 DEPARTS = 1e-6
@@ -138,9 +138,10 @@ def simulate(
     how = replace(way_of(way, scenario), suspected=False)
     if runs < 1:
         raise UsageError(f"runs: expected at least 1, got {runs}")
-    links = link_rows(scenario, None if how.link is None else [how.link])
+    links = asked_links(scenario, how.link)
     if len(links.link) != 1:
-        raise UsageError(f"link: expected one link probability to simulate, got {len(links.link)}; give --link")
+        cases = f" or --case with one of {', '.join(links.names)}" if links.names else ""
+        raise UsageError(f"link: expected one link probability to simulate, got {len(links.link)}; give --link{cases}")
     shown = metric_of(metric or scenario.metric or "trace", scenario.model)
     draws = Draws(scenario, tuple(str(i + 1) for i in range(runs)), links, how.seed)
     if folder is None:

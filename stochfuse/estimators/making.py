@@ -23,6 +23,7 @@ from stochfuse.estimators.together import NaiveTogether, PastsTogether
 from stochfuse.estimators.world import World, error_sources, sources_of, world_of
 from stochfuse.scenario import capabilities, registry
 from stochfuse.scenario.network import default_rows
+from stochfuse.scenario.own_rules import OwnRule
 from stochfuse.scenario.system import Noises, System
 
 MOST_COEFFICIENTS = 20_000
@@ -42,7 +43,7 @@ def make(
 
     Parameters
     ----------
-    name : one of `stochfuse.prediction.predict.ESTIMATORS`.
+    name : one of `stochfuse.scenario.registry.ESTIMATORS`, or an `OwnRule`.
     relabellings : permutations of the agents that change nothing; None if nobody may change places.
     errors : whether noise footprints are carried along, see `stochfuse.estimators.world`.
     records : measurements (steps, agents, p) where states are wanted; of agents that measure less than others what
@@ -60,7 +61,7 @@ def make(
     entry, rule = registry.estimator(name), rule_of(name)
     if not entry.sums:
         more = {"criterion": criterion} if entry.weighs else {}
-        build = partial(rule, kinds=system.labels, relabellings=relabellings, errors=errors, **more)
+        build = partial(rule, kinds=kinds_of(system, name), relabellings=relabellings, errors=errors, **more)
         if records is not None:  # which tell like agents apart
             build = partial(rule, kinds=range(system.agents), relabellings=relabellings, errors=True, **more)
         estimator = build(world_of(system))
@@ -112,7 +113,13 @@ def make_for_data(system: System, name: str, criterion: str = "det") -> Any:
 def rule_of(name: str) -> Any:
     """Return an estimator's class, its file imported when it is asked for."""
     file, kind = registry.estimator(name).place
-    return getattr(import_module(f"stochfuse.estimators.{file}"), kind)
+    found = getattr(import_module(f"stochfuse.estimators.{file}"), kind)
+    return partial(found, rule=name) if isinstance(name, OwnRule) else found
+
+
+def kinds_of(system: System, name: str) -> Sequence[int]:
+    """Kind of every agent; all differ where an estimator minds the order of those heard, which is that of numbers."""
+    return range(system.agents) if getattr(name, "ordered", False) else system.labels
 
 
 def _of_pasts(

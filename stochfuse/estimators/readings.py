@@ -338,7 +338,7 @@ class PastNumbers:
         before = [self._gathered(column * self.pairs.runs + runs) for column in rests_on.reshape(len(keys), -1).T]
         estimator.readings = self.readings.of(runs)
         rules = [pasts.rule[value] for value in values.tolist()]
-        worked = worked_out(estimator, pasts.step[values[0]], rules, before)
+        worked = worked_out(estimator, pasts.step[values[0]], rules, before, values)
         self._add(keys, Worked(*(None if a is None else np.broadcast_to(a, (len(keys), *a.shape[1:])) for a in worked)))
 
     def _add(self, keys: np.ndarray, worked: Worked) -> None:

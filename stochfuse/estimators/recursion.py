@@ -78,6 +78,7 @@ class RecursiveEstimator:
     gathers: str | None = None
     """Name of the rule by which agents that track one state fuse all that they hear; None if they fuse nothing."""
     symmetric: tuple[str, ...] = ()
+    headed: tuple[str, ...] = ()
     mixed: tuple[str, ...] = ()
 
     def __init__(
@@ -92,7 +93,7 @@ class RecursiveEstimator:
         self.relabellings = relabellings or [everyone]
         # where errors do not matter, the first agent of a kind stands for all of it
         self.labels = everyone if errors else tuple(kinds.index(kind) for kind in kinds)
-        self.pasts = Pasts(self.symmetric, kinds if errors else None)
+        self.pasts = Pasts(self.symmetric, kinds if errors else None, self.headed)
         self.errors = errors
         self.readings: Riding | None = None
         self.magnified = 1.0
@@ -275,7 +276,7 @@ class PastClaims:
                 self._settle([b for b, s in enumerate(steps) if s == step - 2])
             steps.append(step)
             rests_on = np.array([estimator.pasts.rests_on[n] for n in numbers], dtype=int).reshape(len(numbers), -1)
-            worked = worked_out(estimator, step, rules, [self._gathered(column) for column in rests_on.T])
+            worked = worked_out(estimator, step, rules, [self._gathered(column) for column in rests_on.T], numbers)
             self._batch[numbers], self._row[numbers] = len(self._worked), np.arange(len(numbers))
             self._worked.append(worked)
         if estimator.readings is None:
@@ -324,11 +325,36 @@ def _filled(parts: Sequence[Any], batches: np.ndarray, batch: np.ndarray, row: n
     return out
 
 
-def worked_out(estimator: RecursiveEstimator, step: int, rules: Sequence[FusionStep], rests_on: list[Worked]) -> Worked:
-    """Work a batch out, and see that covariances come of it."""
+class RuleError(UsageError):
+    """What a fusion rule of one's own does that it must not.
+
+    Parameters
+    ----------
+    why : what it is.
+    item : place of the fusion in its batch.
+    """
+
+    def __init__(self, why: str, item: int = 0) -> None:
+        super().__init__(why)
+        self.item = item
+
+
+def worked_out(
+    estimator: RecursiveEstimator,
+    step: int,
+    rules: Sequence[FusionStep],
+    rests_on: list[Worked],
+    numbers: Sequence[int] | np.ndarray = (),
+) -> Worked:
+    """Work a batch out, and see that covariances come of it; with the pasts' numbers, errors name an agent."""
     mend = "expected noises R that are not negligible beside the errors P, in units in which P is not far from 1"
     try:
         worked = estimator.batch(step, rules, rests_on)
+    except RuleError as error:
+        agent = estimator.pasts.agent_of.get(int(numbers[error.item])) if len(numbers) else None
+        whose = "" if agent is None else f", agent {agent + 1}"
+        name = getattr(estimator, "name", "of one's own")
+        raise RuleError(f"estimator {name}: step {step}{whose}: {error}", error.item) from None
     except np.linalg.LinAlgError:
         raise UsageError(f"step {step}: the covariance of an innovation is singular: {mend}") from None
     variances = np.diagonal(worked.P, axis1=-2, axis2=-1)
@@ -350,19 +376,28 @@ class Pasts(Renamed):
     ----------
     symmetric : names of the rules to which the order of what they rest on does not matter.
     kinds : kind of each agent, where agents may change places with others of their kind.
+    headed : names of the rules to which it does not matter but for the first.
+
+    Attributes
+    ----------
+    agent_of : an agent to which a past belongs, where that is worth remembering.
     """
 
-    def __init__(self, symmetric: Sequence[str] = (), kinds: Sequence[int] | None = None) -> None:
+    def __init__(
+        self, symmetric: Sequence[str] = (), kinds: Sequence[int] | None = None, headed: Sequence[str] = ()
+    ) -> None:
         self.step: list[int] = []
         self.rule: list[FusionStep] = []
         self.rests_on: list[tuple[int, ...]] = []
-        self._symmetric = frozenset(symmetric)
+        self.agent_of: dict[int, int] = {}
+        self._symmetric, self._headed = frozenset(symmetric), frozenset(headed)
         self._number: dict[tuple[int, FusionStep, tuple[int, ...]], int] = {}
-        super().__init__(kinds, None if kinds is None else Pasts(symmetric))
+        super().__init__(kinds, None if kinds is None else Pasts(symmetric, headed=headed))
 
     def number(self, step: int, rule: FusionStep, rests_on: Sequence[int] = ()) -> int:
         """Return the number of a past."""
-        key = (step, rule, tuple(sorted(rests_on) if rule[0] in self._symmetric else rests_on))
+        fixed = 0 if rule[0] in self._symmetric else 1 if rule[0] in self._headed else len(rests_on)
+        key = (step, rule, (*rests_on[:fixed], *sorted(rests_on[fixed:])))
         known = self._number.get(key)
         if known is None:
             known = self._number[key] = len(self.step)
@@ -381,6 +416,8 @@ class Pasts(Renamed):
             name, *agents = self.rule[value]
             rests_on = [self._renamed(n, into, names, known) for n in self.rests_on[value]]
             new = known[value] = into.number(self.step[value], (name, *(names[a] for a in agents)), rests_on)
+            if value in self.agent_of:
+                into.agent_of.setdefault(new, names[self.agent_of[value]])
         return new
 
     def batches(self, mixed: Sequence[str]) -> Iterator[tuple[int, list[FusionStep], np.ndarray]]:

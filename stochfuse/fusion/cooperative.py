@@ -12,6 +12,18 @@ and H_i = −H_j throughout.  A direction's noise is σ²I in angle, so that no 
 frame.  A difference with both standard deviations has R = σ_r²uuᵀ + d²σ_d²TTᵀ and carries exactly the information of
 "both"; with σ_range alone its noise is alike in every direction, and the nodes may coincide.
 
+Attitude that is not known: where the observer measures in its own frame, and that is turned by a small φ (from where it
+is believed to be; in the plane an angle to the left, in space a vector of three about the common axes), what it sees is
+turned by −φ.  So the rows above have, over φ,
+
+    range        0             direction, in the plane   −1        in space   Tᵀ [u×]        difference  y   [y×]φ
+
+(`attitude`).  Clocks: time transfer, there and back, measures the difference of two clock errors whatever the places,
+
+    time         y = b_i − b_j                  H_i = 1, H_j = −1
+
+(`time_transfer`); and any relation that is linear in two states is given by its H_i, H_j and R (`linear`).
+
 Local, with immediate neighbours (LWIN): the neighbour's error is taken for noise,
 
     R̃ = H_j P_jj H_jᵀ + R        P_i ← update(P_ii, H_i, R̃)
@@ -21,8 +33,8 @@ nodes, (27), which a cooperative measurement with H = (… H_i … H_j …) upda
 
 Source: patent "Cooperative estimator", equations (10)–(18) (LWIN), (23)–(26) (range), (27) (ITNS).  Departures: its
 (17) is the short form (I − KH)P, here the kernel's Joseph form; its LOS equations (21), (22) and (28) include the
-node's attitude, which is taken as known here (the direction is resolved in the common frame); its text gives the gain
-of ITNS with the composite covariance (13) of LWIN; here it acts on the joint covariance, as the claims have it.
+node's attitude, here an addition to a direction resolved in the common frame; its text gives the gain of ITNS with the
+composite covariance (13) of LWIN; here it acts on the joint covariance, as the claims have it.
 """
 
 from __future__ import annotations
@@ -33,6 +45,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.errors import UsageError
+from stochfuse.kalman.checks import covariance_fault
 from stochfuse.kalman.kernel import Estimate, update
 
 KINDS = ("range", "direction", "both", "difference")
@@ -159,6 +172,91 @@ def relation(
         H_j = np.broadcast_to(-np.eye(u.shape[-1]), H_j.shape).copy()
         R = (to_places * np.diagonal(R)) @ np.swapaxes(to_places, -1, -2)
     return Relation(-H_j, H_j, R)
+
+
+def attitude(kind: str, r_i: Any, r_j: Any) -> np.ndarray:
+    """How a measurement in the observer's own frame changes as that frame turns: H over its attitude's errors.
+
+    Parameters
+    ----------
+    kind, r_i, r_j : as for `relation`, in whose rows this is; of a difference by its components.
+
+    Returns
+    -------
+    (..., p, 1) or (..., p, 3) array
+        In the plane over the angle by which the observer is turned left, in space over the small rotation about the
+        common axes, rad.
+    """
+    _check_kind(kind)
+    if kind == "difference":
+        r_i, r_j = _places(r_i, r_j)
+        return _turned(r_i - r_j)
+    _, u = _line_of_sight(r_i, r_j)
+    rows = np.swapaxes(_tangent(u), -1, -2) @ _turned(u)
+    along = np.zeros((*rows.shape[:-2], 1, rows.shape[-1]))
+    return np.concatenate({"range": [along], "direction": [rows], "both": [along, rows]}[kind], axis=-2)
+
+
+def _turned(y: np.ndarray) -> np.ndarray:
+    """What −φ × y is of φ: [y×] in space, a column in the plane."""
+    if y.shape[-1] == 2:
+        return np.stack([y[..., 1:], -y[..., :1]], axis=-2)
+    x, y_, z = (y[..., k] for k in range(3))
+    none = np.zeros_like(x)
+    return np.stack([none, -z, y_, z, none, -x, -y_, x, none], axis=-1).reshape(*y.shape, 3)
+
+
+def time_transfer(sigma: float) -> Relation:
+    """Difference of two clock errors, b_i − b_j, of a standard deviation in their unit; over the clock errors alone.
+
+    Raises
+    ------
+    UsageError
+        If the standard deviation is not positive.
+    """
+    if not 0 < sigma < np.inf:
+        raise UsageError(f"sigma: expected a positive standard deviation, got {sigma}")
+    return Relation(np.eye(1), -np.eye(1), np.array([[float(sigma) ** 2]]))
+
+
+def linear(H_i: Any, H_j: Any, R: Any) -> Relation:
+    """Any relation that is linear in the two states, y = H_i x_i + H_j x_j + s with s ~ N(0, R).
+
+    Parameters
+    ----------
+    H_i, H_j : (p, d_i) and (p, d_j).
+    R : (p, p) positive semi-definite.
+
+    Raises
+    ------
+    UsageError
+        If the shapes do not fit together, or R is no covariance.
+    """
+    H_i, H_j, R = (np.asarray(M, dtype=float) for M in (H_i, H_j, R))
+    p = H_i.shape[0] if H_i.ndim == 2 else -1
+    if H_j.ndim != 2 or H_j.shape[0] != p or R.shape != (p, p):
+        raise UsageError(
+            f"H_i, H_j, R: expected shapes (p, d_i), (p, d_j) and (p, p), got {H_i.shape}, {H_j.shape} and {R.shape}"
+        )
+    fault = covariance_fault(R)
+    if fault is not None or not (np.isfinite(H_i).all() and np.isfinite(H_j).all()):
+        raise UsageError(f"H_i, H_j, R: expected finite matrices and a covariance R, got {fault or 'others'}")
+    return Relation(H_i, H_j, R)
+
+
+def together(*parts: Relation) -> Relation:
+    """Several relations between the same two states measured at once, with independent noises, one above the other."""
+    leading = np.broadcast_shapes(*(part.H_i.shape[:-2] for part in parts))
+    H_i, H_j = (
+        np.concatenate([np.broadcast_to(M, (*leading, *M.shape[-2:])) for M in matrices], axis=-2)
+        for matrices in ([part.H_i for part in parts], [part.H_j for part in parts])
+    )
+    leading = np.broadcast_shapes(*(part.R.shape[:-2] for part in parts))
+    R, first = np.zeros((*leading, H_i.shape[-2], H_i.shape[-2])), 0
+    for part in parts:
+        rows = slice(first, first + part.R.shape[-1])
+        R[..., rows, rows], first = part.R, rows.stop
+    return Relation(H_i, H_j, R)
 
 
 def over_states(H: np.ndarray, positions: Sequence[int], d: int) -> np.ndarray:

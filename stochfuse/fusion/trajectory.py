@@ -93,6 +93,21 @@ def radii(latitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
+def geodetic(path: Trajectory, every: int = 1) -> np.ndarray:
+    """Return latitude, longitude from the start (rad) and height (m) at every n-th tick, (n, 3)."""
+    _, transverse = radii(path.latitude)
+    rate = 1.0 / (path.time[1] - path.time[0])
+    longitude = _integral(path.velocity[:, 1] / ((transverse + path.height) * np.cos(path.latitude)), rate)
+    return np.stack([path.latitude, longitude, path.height], axis=-1)[::every]
+
+
+def displaced(where: np.ndarray, ned: np.ndarray) -> np.ndarray:
+    """Return latitude, longitude and height (..., 3) after small ways along north, east, down, m."""
+    meridian, transverse = radii(where[..., 0])
+    per_metre = [1 / (meridian + where[..., 2]), 1 / ((transverse + where[..., 2]) * np.cos(where[..., 0]))]
+    return where + np.stack([per_metre[0] * ned[..., 0], per_metre[1] * ned[..., 1], -ned[..., 2]], axis=-1)
+
+
 def gravity(latitude: np.ndarray, height: np.ndarray) -> np.ndarray:
     """Return the size of gravity, m/s²: Somigliana at the ellipsoid, falling with the square of the distance above."""
     sine = np.sin(latitude) ** 2

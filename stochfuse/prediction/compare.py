@@ -16,6 +16,7 @@ from stochfuse.prediction.result import Prediction
 from stochfuse.prediction.swept import Swept
 from stochfuse.scenario.over import Over
 from stochfuse.scenario.over import over as read_over
+from stochfuse.scenario.own_rules import estimators_named
 from stochfuse.scenario.registry import CHAIN, ESTIMATORS, GENERAL, METHODS, MONTE_CARLO, NAIVE, OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.result import Result
 from stochfuse.scenario.scenario import Scenario, of_scenario
@@ -160,7 +161,7 @@ class EstimatorComparison(Result):
 def compare_estimators(
     scenario: Scenario,
     link: Sequence[float] | np.ndarray | float | None = None,
-    estimators: Sequence[str] | None = None,
+    estimators: Sequence[Any] | None = None,
     method: str | None = None,
     *,
     quantities: Sequence[str] = SIDE_BY_SIDE,
@@ -172,7 +173,8 @@ def compare_estimators(
     Parameters
     ----------
     scenario, link : as for `predict`.
-    estimators : names out of `stochfuse.prediction.predict.ESTIMATORS`; default: all that the scenario takes.
+    estimators : names out of `stochfuse.scenario.registry.ESTIMATORS`, and rules of your own, as for `predict`;
+        default: all that the scenario takes.
     method : "general" or "monte-carlo"; default: exact where up to 2,000 graphs (or `max_graphs`) have to be carried
         and no runs are asked for, else sampled, with the same arrivals for all estimators.
     over : values of one or two numbers of the scenario by their paths, as for `predict`: the rows.
@@ -191,10 +193,7 @@ def compare_estimators(
     >>> [round(float(ratio[0, -1]), 3) for ratio in found.values("consistency")]
     [1.272, 0.75]
     """
-    for name in estimators or ():
-        choose("estimator", name, ESTIMATORS)
-    if len(set(estimators or ())) < len(estimators or ()):
-        raise UsageError(f"estimator: expected different ones, got {', '.join(estimators or ())}")
+    names = estimators_named(estimators or ())
     if method is not None:
         choose("methods", method, (GENERAL, MONTE_CARLO))
     for quantity in quantities:
@@ -204,12 +203,12 @@ def compare_estimators(
         settings["over"] = read_over(scenario, over)
     found: list[Prediction | Swept] = []
     left_out: dict[str, list[str]] = {}
-    for name in estimators or ESTIMATORS:
+    for name in names or ESTIMATORS:
         try:
             found.append(_estimated(scenario, link, name, method, hardest, settings).shown_as(quantities[0]))
         except (UsageError, NoAnswerError) as error:
             reason = str(error).removeprefix(f"estimator {name}: ")
-            if estimators:
+            if names:
                 raise type(error)(f"estimator {name}: {reason}") from None
             left_out.setdefault(reason, []).append(name)
     if not found:

@@ -24,6 +24,7 @@ from stochfuse.prediction.method import Settings, group_of
 from stochfuse.prediction.sampled import states
 from stochfuse.prediction.states import predict_states
 from stochfuse.scenario import registry
+from stochfuse.scenario.own_rules import estimator_named
 from stochfuse.scenario.registry import GENERAL, LFG, MONTE_CARLO, SIMPLIFIED
 from stochfuse.scenario.result import Result
 from stochfuse.scenario.scenario import Scenario, link_rows, of_scenario
@@ -106,7 +107,8 @@ def expected_states(
         raise UsageError(f"states: expected method {', '.join(TAKEN)}, got {method}")
     rows, z = link_rows(scenario, link), _checked(scenario, measurements)
     more: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
-    how, estimator = _settings(method, settings), settings.get("estimator", LFG)
+    estimator = estimator_named(settings.get("estimator", LFG))
+    how = _settings(method, {**settings, "estimator": estimator} if "estimator" in settings else settings)
     if method == SIMPLIFIED:
         x, estimator = predict_states(scenario, z, rows).x, registry.BROADCAST_PRIOR  # type: ignore[arg-type]
     elif method == GENERAL:

@@ -39,7 +39,7 @@ from stochfuse.engines.precision import NO_DIGIT, PROMISED, MovedSources, change
 from stochfuse.engines.progress import listener
 from stochfuse.errors import NoAnswerError, StochfuseError, TooManyError, UsageError
 from stochfuse.estimators.ledger import InformationClaims, evaluate
-from stochfuse.estimators.making import make, sources
+from stochfuse.estimators.making import kinds_of, make, sources
 from stochfuse.estimators.protocol import Claims, Made
 from stochfuse.estimators.world import claimed_only, moments
 from stochfuse.kalman.kernel import Estimate
@@ -593,7 +593,7 @@ def _enumerated(
     network = system.network
     check_size(network)
     # records tell like agents apart
-    kinds = system.labels if records is None else tuple(range(network.agents))
+    kinds = kinds_of(system, how.estimator) if records is None else tuple(range(network.agents))
     permutations = relabellings(network, links, kinds)
     # a bursty link keeps its state where it is: nobody may change places
     fixed = plain or links.bursts is not None

@@ -50,7 +50,8 @@ class Settings:
 
     Parameters
     ----------
-    estimator : what the agents do with what arrives, one of `stochfuse.scenario.registry.ESTIMATORS`.
+    estimator : what the agents do with what arrives, one of `stochfuse.scenario.registry.ESTIMATORS`; or a rule of
+        your own, by "package.module:Class", as a class or as an object, see `stochfuse.estimators.own`.
     max_graphs : general: different graphs that may be carried from step to step.
     prune : general: leave the least likely graphs out where there are more, instead of giving up.
     runs, seed : monte-carlo: independent runs per link probability, and the seed.

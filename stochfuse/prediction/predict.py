@@ -30,10 +30,10 @@ from stochfuse.scenario import capabilities, registry
 from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.over import Over
 from stochfuse.scenario.over import over as read_over
+from stochfuse.scenario.own_rules import estimator_named
 from stochfuse.scenario.registry import (
     CONTROLS,
     CRITERIA,
-    ESTIMATORS,
     GENERAL,
     LFG,
     METHODS,
@@ -467,7 +467,7 @@ def _asked(scenario: Scenario, method: str | None, quantity: str, settings: Mapp
         near = nearest(wrong, known)
         raise TypeError(f"predict() got an unexpected keyword argument '{wrong}'{near}; expected {', '.join(known)}")
     how = Settings(**{"estimator": scenario.estimator or LFG, "runs": scenario.runs or RUNS, **settings})
-    choose("estimator", how.estimator, ESTIMATORS)
+    how = replace(how, estimator=estimator_named(how.estimator))
     choose("criterion", how.criterion, CRITERIA)
     choose("control", how.control, CONTROLS)
     _check_precision(method, how, settings)
@@ -498,8 +498,8 @@ def _check_precision(method: str, how: Settings, given: Mapping[str, Any]) -> No
 
 def _by_any(scenario: Scenario, link: Any, quantity: str, settings: Mapping[str, Any]) -> Prediction:
     """Predict an estimator by the exact engine that takes it, else by sampling, and say which."""
-    name = settings["estimator"]
-    choose("estimator", name, ESTIMATORS)
+    name = estimator_named(settings["estimator"])
+    settings = {**settings, "estimator": name}
     features = capabilities.features_of(scenario.system, link_rows(scenario, link))
     engines = capabilities.engine_for(name, features) or [registry.GENERAL]
     for engine in engines:

@@ -27,7 +27,7 @@ from stochfuse.engines.contact_sample import sample_optimum
 from stochfuse.engines.events import concerning, events, relabellings
 from stochfuse.engines.monte_carlo import Experiment, Sample, sample, size_of_block
 from stochfuse.errors import UsageError
-from stochfuse.estimators.making import make, make_together
+from stochfuse.estimators.making import kinds_of, make, make_together
 from stochfuse.estimators.protocol import Claims, Estimator
 from stochfuse.estimators.world import claimed_only, moments
 from stochfuse.kalman.metrics import Metric, Moments
@@ -251,7 +251,7 @@ def sampled(
     """
     shown = how.shown if how.shown.quantities else replace(how.shown, quantities=("actual" if errors else "claimed",))
     _check(system, links, how)
-    network, kinds = system.network, system.labels
+    network, kinds = system.network, kinds_of(system, how.estimator)
     permutations = relabellings(network, links, kinds)
     groups = groups_alike(network, links, kinds, permutations)
     odds = _odds(system, links, groups, how.estimator)
@@ -449,7 +449,8 @@ def _drawn(
     workers = how.workers
     if workers is None:
         outcomes = how.runs * rows * (1 if experiment.together is None else network.agents)
-        workers = len(os.sched_getaffinity(0)) if outcomes >= MANY else 1
+        many = outcomes >= MANY and getattr(how.estimator, "travels", True)
+        workers = len(os.sched_getaffinity(0)) if many else 1
     return sample(experiment, rows, workers=workers)
 
 

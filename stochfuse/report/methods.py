@@ -2,28 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 from stochfuse import __version__
 from stochfuse.report.table import Report, Table, to_csv
 from stochfuse.scenario import capabilities, registry
+from stochfuse.scenario.own_rules import OwnRule
 
 SCHEMA = "stochfuse.methods/1"
 
 
-def methods_report(matrix: bool = False) -> Report:
-    """Return what there is, or the capability table, in every form."""
-    return Report(partial(methods_table, matrix=matrix), partial(methods_csv, matrix=matrix), methods_json)
+def methods_report(matrix: bool = False, own: Sequence[OwnRule] = ()) -> Report:
+    """Return what there is and rules of the user's own, or the capability table, in every form."""
+    more: Any = {"matrix": matrix, "own": own}
+    return Report(partial(methods_table, **more), partial(methods_csv, **more), partial(methods_json, own))
 
 
-def methods_table(*, matrix: bool = False) -> Table:
+def methods_table(*, matrix: bool = False, own: Sequence[OwnRule] = ()) -> Table:
     """Return everything that can be asked for by its name; or, for each estimator and engine, what is not taken."""
-    return _matrix_table() if matrix else _listing_table()
+    return _matrix_table(own) if matrix else _listing_table(own)
 
 
-def _listing_table() -> Table:
-    rows = [("estimator", e.name, f"{e.title} ({e.source})") for e in registry.ESTIMATOR]
+def _entries(own: Sequence[OwnRule]) -> list[registry.EstimatorEntry]:
+    return [*registry.ESTIMATOR, *(name.entry for name in own)]
+
+
+def _listing_table(own: Sequence[OwnRule]) -> Table:
+    rows = [("estimator", e.name, f"{e.title} ({e.source})") for e in _entries(own)]
     rows += [("method", e.name, f"{e.title}, {e.source}: {e.help}; {e.nature}") for e in registry.ENGINE]
     e = registry.REPLAY
     rows += [("engine", e.name, f"{e.source}: {e.help}; {e.nature}")]
@@ -37,9 +44,9 @@ def _listing_table() -> Table:
     return Table(title, ("option", "name", "what it is"), (), tuple(rows))
 
 
-def _matrix_table() -> Table:
+def _matrix_table(own: Sequence[OwnRule]) -> Table:
     rows = []
-    for estimator, engine in capabilities.pairs():
+    for estimator, engine in capabilities.pairs(own):
         why = {f.name: capabilities.reason(estimator, engine, f.name) for f in capabilities.FEATURES}
         rows.append((estimator, engine, ", ".join(name for name, reason in why.items() if reason) or "takes all"))
     title = (
@@ -51,26 +58,26 @@ def _matrix_table() -> Table:
     return Table(title, ("estimator", "method", "does not take"), (), tuple(rows))
 
 
-def methods_csv(*, matrix: bool = False) -> str:
+def methods_csv(*, matrix: bool = False, own: Sequence[OwnRule] = ()) -> str:
     """Return the same as CSV: of the matrix every cell, with the reason where it says no."""
     if not matrix:
-        table = methods_table()
+        table = methods_table(own=own)
         return to_csv(table.headings, table.rows)
     cells = [
         (estimator, engine, feature, "" if reason is True else reason)
-        for estimator, engines in capabilities.matrix().items()
+        for estimator, engines in capabilities.matrix(own).items()
         for engine, features in engines.items()
         for feature, reason in features.items()
     ]
     return to_csv(("estimator", "method", "feature", "reason"), cells)
 
 
-def methods_json() -> dict[str, Any]:
+def methods_json(own: Sequence[OwnRule] = ()) -> dict[str, Any]:
     """Return registry and table with the keys of the schema."""
     return {
         "schema": SCHEMA,
         "version": __version__,
-        "estimators": [{"name": e.name, "title": e.title, "source": e.source} for e in registry.ESTIMATOR],
+        "estimators": [{"name": e.name, "title": e.title, "source": e.source} for e in _entries(own)],
         "engines": [
             {"name": e.name, "title": e.title, "source": e.source, "nature": e.nature, "help": e.help}
             for e in registry.ENGINE
@@ -80,5 +87,5 @@ def methods_json() -> dict[str, Any]:
         "metrics": [{"name": m.name, "help": m.help} for m in registry.METRIC],
         "statistics": [{"name": s.name, "help": s.help} for s in registry.STATISTIC],
         "features": [{"name": f.name, "key": f.key} for f in capabilities.FEATURES],
-        "matrix": capabilities.matrix(),
+        "matrix": capabilities.matrix(own),
     }

@@ -154,8 +154,13 @@ def run_json(found: RunResult) -> dict[str, Any]:
 def draw(found: RunResult) -> Any:
     """Return the figure: error and ±2σ of every agent over the steps, below it what arrived, and NEES with its band.
 
-    Without a truth: estimates in the place of errors, and NIS in that of NEES.
+    Without a truth: estimates in the place of errors, and NIS in that of NEES.  Of an inertial navigation system: its
+    position instead, see `stochfuse.report.navigation`.
     """
+    if "navigation" in found.scenario.source and not np.isnan(found.traces[0].truth).any():
+        from stochfuse.report.navigation import draw_navigation
+
+        return draw_navigation(found, _titles(found)[:2], _averages)
     n = found.scenario.network.agents
     agents = range(min(n, MOST_AGENTS))
     columns = min(len(agents), 3)

@@ -16,6 +16,7 @@ import numpy as np
 from stochfuse.errors import UsageError
 from stochfuse.scenario import registry
 from stochfuse.scenario.network import LinkRows
+from stochfuse.scenario.own_rules import OwnRule
 from stochfuse.scenario.registry import BROADCAST_PRIOR, CHAIN, ENGINES, ESTIMATORS, GENERAL, MONTE_CARLO, SIMPLIFIED
 from stochfuse.scenario.system import System
 
@@ -229,10 +230,22 @@ ENDLESS = "a model, sensors and links that do not vary with the step, or sensors
 """Features that have no steady state, but that of sensors with periods, and what is expected in their place."""
 
 
-def pairs() -> list[tuple[str, str]]:
-    """Estimators with the engines that average them."""
-    both = [(estimator, engine) for estimator in ESTIMATORS for engine in (GENERAL, MONTE_CARLO)]
+def pairs(own: Sequence[OwnRule] = ()) -> list[tuple[str, str]]:
+    """Estimators, and rules of the user's own, with the engines that average them."""
+    both = [(estimator, engine) for estimator in (*ESTIMATORS, *own) for engine in (GENERAL, MONTE_CARLO)]
     return [(BROADCAST_PRIOR, SIMPLIFIED), (registry.OPTIMAL, CHAIN), *both]
+
+
+def _rules(estimator: str) -> tuple[Rule, ...]:
+    """The table, and what a rule of the user's own says of itself."""
+    if not isinstance(estimator, OwnRule):
+        return RULES
+    known = [feature.name for feature in FEATURES]
+    for name in estimator.refuses:
+        if name not in known:
+            raise UsageError(f"estimator {estimator}: refuses: expected features of {', '.join(known)}, got '{name}'")
+    own = [Rule("estimator {estimator}", lambda *_: True, (name,), why) for name, why in estimator.refuses.items()]
+    return (*RULES, *own)
 
 
 def averaged_by(engine: str) -> str | None:
@@ -242,9 +255,10 @@ def averaged_by(engine: str) -> str | None:
 
 def not_averaged(estimator: str, engine: str) -> str | None:
     """Why an engine does not average an estimator, or None if it does."""
-    if (estimator, engine) in pairs():
+    known = pairs([estimator] if isinstance(estimator, OwnRule) else [])
+    if (estimator, engine) in known:
         return None
-    others = [e for who, e in pairs() if who == estimator]
+    others = [e for who, e in known if who == estimator]
     averages = "the broadcast prior" if engine == SIMPLIFIED else "the optimum" if engine == CHAIN else "estimators"
     return f"{engine} averages {averages} alone; {' or '.join(others)} takes {estimator}"
 
@@ -254,7 +268,7 @@ def reason(estimator: str, engine: str, feature: str) -> str | None:
     elsewhere = not_averaged(estimator, engine)
     if elsewhere is not None:
         return elsewhere
-    for rule in RULES:
+    for rule in _rules(estimator):
         if feature in rule.features and not rule.beside and rule.concerns(estimator, engine):
             return f"{rule.who.format(estimator=estimator)}: {rule.why}; {_instead(estimator, feature)}"
     return None
@@ -283,7 +297,7 @@ def require(system: System, links: LinkRows, estimator: str, engine: str) -> Non
     links : rows of links; estimators do not look at them.
     """
     has = {feature.name: feature.has for feature in FEATURES}
-    for rule in RULES:
+    for rule in _rules(estimator):
         if not rule.concerns(estimator, engine) or (rule.beside and not has[rule.beside](system, links)):
             continue
         for name in rule.features:
@@ -337,12 +351,17 @@ def not_on_data(estimator: str, has: Sequence[str]) -> str | None:
     return None
 
 
-def matrix() -> dict[str, dict[str, dict[str, bool | str]]]:
-    """Return the whole table: estimator, engine, feature → True or the reason."""
+def matrix(own: Sequence[OwnRule] = ()) -> dict[str, dict[str, dict[str, bool | str]]]:
+    """Return the whole table: estimator, engine, feature → True or the reason.
+
+    Parameters
+    ----------
+    own : rules of the user's, shown too.
+    """
     names = [feature.name for feature in FEATURES]
     return {
         estimator: {engine: {name: reason(estimator, engine, name) or True for name in names} for engine in ENGINES}
-        for estimator in (*ESTIMATORS, BROADCAST_PRIOR)
+        for estimator in (*ESTIMATORS, *own, BROADCAST_PRIOR)
     }
 
 

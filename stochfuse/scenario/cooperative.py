@@ -1,11 +1,12 @@
 """Reading [cooperative] and the agents' places: who measures what of whom, linearised about the nominal places.
 
-    [cooperative]  positions (names of 2 or 3 states), range and direction (standard deviations, of every pair)
-    [[cooperative.pair]]  agents = [observer, other], range, direction, none, both_ways, where a pair differs
+    [cooperative]  positions (names of 2 or 3 states), range and direction (standard deviations, of every pair),
+                   attitude (1 or 3 states: a direction is measured in the observer's own frame), clock (a state), time
+    [[cooperative.pair]]  agents = [observer, other], range, direction, time; or H_i, H_j, R; or none; both_ways
     [[agent]]      position: nominal place, or one per step
 
-A pair's own table takes the place of range and direction of [cooperative] altogether: what it leaves out, the pair
-does not measure.
+A pair's own table takes the place of range, direction and time of [cooperative] altogether: what it leaves out, the
+pair does not measure.  Places are needed where a range or a direction is measured.
 """
 
 from __future__ import annotations
@@ -16,7 +17,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.fusion.cooperative import Relation, coincident, over_states, relation
+from stochfuse.errors import UsageError
+from stochfuse.fusion.cooperative import (
+    Relation,
+    attitude,
+    coincident,
+    linear,
+    over_states,
+    relation,
+    time_transfer,
+    together,
+)
 from stochfuse.kalman.checks import shown
 from stochfuse.scenario.checker import Checker
 
@@ -26,7 +37,7 @@ class Relations(NamedTuple):
 
     Parameters
     ----------
-    positions : indices of the states that are the place.
+    positions : indices of the states that are the place; empty where nothing depends on it.
     pairs : for observer i and other j, counted from 0, the relation over the full state: H_i, H_j of shape (p, d), or
         (steps, p, d) where a place is given per step, and R (p, p).  An ordered pair that is left out measures nothing.
     """
@@ -38,10 +49,23 @@ class Relations(NamedTuple):
 class _Noise(NamedTuple):
     range: float | None
     direction: float | None
+    time: float | None
 
     @property
     def kind(self) -> str:
-        return "range" if self.direction is None else "direction" if self.range is None else "both"
+        """What of the places is measured."""
+        if self.range is None:
+            return "" if self.direction is None else "direction"
+        return "range" if self.direction is None else "both"
+
+
+class _States(NamedTuple):
+    """Indices of the states that are the place, the attitude and the clock of an agent, and how many states it has."""
+
+    positions: tuple[int, ...]
+    attitude: tuple[int, ...]
+    clock: tuple[int, ...]
+    d: int
 
 
 def read_cooperative(
@@ -73,38 +97,68 @@ def read_cooperative(
         if table is None and placed:
             check.note("cooperative", f"a table, since agent[{placed[0]}].position is given", "nothing")
         return None
-    positions = _positions(check, table.get("positions"), states)
-    noises = _noises(check, table, agents)
-    if positions is None:
+    noises = _noises(check, table, agents, len(states))
+    where = _states(check, table, states, list(noises.values()))
+    if where is None:
         return None
-    places = _places(check, nodes, len(positions), agents, steps)
+    if noises and not any(isinstance(noise, _Noise) and noise.kind for noise in noises.values()):
+        return Relations((), {pair: _related(noise, where, None, None) for pair, noise in noises.items()})
+    places = _places(check, nodes, len(where.positions), agents, steps)
     if places is None:
         return None
-    return Relations(positions, _relations(check, noises, places, positions, len(states)))
+    return Relations(where.positions, _relations(check, noises, places, where))
 
 
-def _positions(check: Checker, names: Any, states: Sequence[str]) -> tuple[int, ...] | None:
-    expected = "the names of the 2 or 3 states that are the place"
-    if not isinstance(names, list | tuple) or len(names) not in (2, 3) or len(set(map(str, names))) < len(names):
-        check.note("cooperative.positions", expected, "nothing" if names is None else shown(names))
-        return None
-    known = [check.choice(f"cooperative.positions[{k}]", name, states) for k, name in enumerate(names, start=1)]
-    return None if None in known else tuple(states.index(name) for name in names)
+def _states(
+    check: Checker, table: Mapping[str, Any], states: Sequence[str], related: Sequence[_Noise | Relation]
+) -> _States | None:
+    """States by their names; None where one that is needed is not there."""
+    before, measured = len(check.problems), [noise for noise in related if isinstance(noise, _Noise)]
+    place: tuple[int, ...] = ()
+    if table.get("positions") is not None or any(noise.kind for noise in measured) or not related:
+        expected = "the names of the 2 or 3 states that are the place"
+        place = _named(check, table, "positions", states, (2, 3), expected)
+    turned: tuple[int, ...] = ()
+    if table.get("attitude") is not None:
+        count = 1 if len(place) == 2 else 3
+        what = "the name of the state that turns" if count == 1 else "the names of the 3 states that turn"
+        turned = _named(check, table, "attitude", states, (count,), f"{what} an agent's frame")
+        if not any(noise.direction for noise in measured):
+            check.note("cooperative.attitude", "a direction that is measured in that frame", "none")
+    clock: tuple[int, ...] = ()
+    if any(noise.time for noise in measured) or table.get("clock") is not None:
+        one = {"clock": [table["clock"]] if table.get("clock") is not None else None}
+        clock = _named(check, one, "clock", states, (1,), "the name of the state that is the clock's error")
+        if not any(noise.time for noise in measured) and table.get("time") is None:
+            check.note("cooperative.clock", "a time that is measured", "none")
+    return None if len(check.problems) > before else _States(place, turned, clock, len(states))
 
 
-def _noises(check: Checker, table: Mapping[str, Any], agents: int) -> dict[tuple[int, int], _Noise]:
+def _named(
+    check: Checker, table: Mapping[str, Any], key: str, states: Sequence[str], counts: tuple[int, ...], expected: str
+) -> tuple[int, ...]:
+    """Indices of states that are named under a key of [cooperative]; empty where that is noted as wrong."""
+    path, names = f"cooperative.{key}", table.get(key)
+    if not isinstance(names, list | tuple) or len(names) not in counts or len(set(map(str, names))) < len(names):
+        check.note(path, expected, "nothing" if names is None else shown(names))
+        return ()
+    known = [check.choice(f"{path}[{k}]", name, states) for k, name in enumerate(names, start=1)]
+    return () if None in known else tuple(states.index(name) for name in names)
+
+
+def _noises(check: Checker, table: Mapping[str, Any], agents: int, d: int) -> dict[tuple[int, int], _Noise | Relation]:
     """Return what each ordered pair measures; pairs that measure nothing are left out."""
     if not _measures(table) and not table.get("pair"):
         expected = "a standard deviation here, in cooperative.direction or in [[cooperative.pair]]"
         check.note("cooperative.range", expected, "nothing")
     common = _noise(check, "cooperative", table)
-    noises = dict.fromkeys(permutations(range(agents), 2), common)
+    noises: dict[tuple[int, int], Any] = dict.fromkeys(permutations(range(agents), 2), common)
     listed = set()
     for k, pair in enumerate(_listed(table.get("pair")), start=1):
         if not isinstance(pair, dict):
             continue
         path = f"cooperative.pair[{k}]"
-        noise = _pair_noise(check, path, pair)
+        noise = _pair_noise(check, path, pair, d)
         ends = _ends(check, f"{path}.agents", pair.get("agents"), agents)
         if ends is None:
             continue
@@ -121,22 +175,50 @@ def _listed(value: Any) -> Sequence[Any]:
 
 
 def _measures(table: Mapping[str, Any]) -> bool:
-    return table.get("range") is not None or table.get("direction") is not None
+    return any(table.get(key) is not None for key in _Noise._fields)
 
 
-def _pair_noise(check: Checker, path: str, pair: Mapping[str, Any]) -> _Noise | None:
+def _pair_noise(check: Checker, path: str, pair: Mapping[str, Any], d: int) -> _Noise | Relation | None:
+    matrices = [pair.get(key) for key in Relation._fields]
+    if any(M is not None for M in matrices):
+        return _linear(check, path, pair, d)
     if pair.get("none"):
         if _measures(pair):
             check.note(path, "either a standard deviation or none = true", "both")
         return None
     if not _measures(pair):
-        check.note(path, "range, direction or none = true", "none of them")
+        check.note(path, "range, direction, time, H_i with H_j and R, or none = true", "none of them")
     return _noise(check, path, pair)
+
+
+def _linear(check: Checker, path: str, pair: Mapping[str, Any], d: int) -> Relation | None:
+    """A relation given by its matrices."""
+    if pair.get("none") or _measures(pair):
+        check.note(path, "either H_i, H_j and R or another measurement", "both")
+        return None
+    R = check.array(f"{path}.R", pair.get("R"), "a covariance (p, p), or a number")
+    p = 1 if R is None or R.ndim == 0 else len(R)
+    expected = f"a matrix of {p} row{'s' * (p > 1)} (of R) and {d} column{'s' * (d > 1)} (of the states)"
+    H_i, H_j = (check.array(f"{path}.{key}", pair.get(key), expected) for key in ("H_i", "H_j"))
+    if R is None or H_i is None or H_j is None:
+        for key in Relation._fields:
+            if pair.get(key) is None:
+                check.note(f"{path}.{key}", "a matrix beside the others of H_i, H_j and R", "nothing")
+        return None
+    for key, M in (("H_i", H_i), ("H_j", H_j)):
+        if np.atleast_2d(M).shape != (p, d):
+            check.note(f"{path}.{key}", expected, shown(pair[key]))
+            return None
+    try:
+        return linear(np.atleast_2d(H_i), np.atleast_2d(H_j), np.atleast_2d(R))
+    except UsageError:
+        check.note(f"{path}.R", "a covariance", shown(pair["R"]))
+        return None
 
 
 def _noise(check: Checker, path: str, table: Mapping[str, Any]) -> _Noise | None:
     noise = _Noise(*(_deviation(check, f"{path}.{key}", table.get(key)) for key in _Noise._fields))
-    return None if noise == (None, None) else noise
+    return noise if any(sigma is not None for sigma in noise) else None
 
 
 def _deviation(check: Checker, path: str, value: Any) -> float | None:
@@ -187,13 +269,15 @@ def _places(check: Checker, nodes: list[Any], coordinates: int, agents: int, ste
 
 def _relations(
     check: Checker,
-    noises: Mapping[tuple[int, int], _Noise],
+    noises: Mapping[tuple[int, int], _Noise | Relation],
     places: Sequence[np.ndarray],
-    positions: tuple[int, ...],
-    d: int,
+    where: _States,
 ) -> dict[tuple[int, int], Relation]:
     related, refused = {}, set()
     for (i, j), noise in noises.items():
+        if isinstance(noise, Relation) or not noise.kind:
+            related[i, j] = _related(noise, where, None, None)
+            continue
         meeting = np.atleast_1d(coincident(places[i], places[j]))
         if meeting.any():
             first, second = sorted((i, j))
@@ -205,6 +289,22 @@ def _relations(
                 check.note(f"agent[{second + 1}].position", expected, f"{place.tolist()}{when} (no direction)")
             refused.add((first, second))
             continue
-        H_i, H_j, R = relation(noise.kind, places[i], places[j], noise.range, noise.direction)
-        related[i, j] = Relation(over_states(H_i, positions, d), over_states(H_j, positions, d), R)
+        related[i, j] = _related(noise, where, places[i], places[j])
     return related
+
+
+def _related(noise: _Noise | Relation, where: _States, r_i: Any, r_j: Any) -> Relation:
+    """What a pair measures, over its full states."""
+    if isinstance(noise, Relation):
+        return noise
+    parts = []
+    if noise.kind:
+        H_i, H_j, R = relation(noise.kind, r_i, r_j, noise.range, noise.direction)
+        H_i, H_j = (over_states(H, where.positions, where.d) for H in (H_i, H_j))
+        if where.attitude:
+            H_i = H_i + over_states(attitude(noise.kind, r_i, r_j), where.attitude, where.d)
+        parts.append(Relation(H_i, H_j, R))
+    if noise.time is not None:
+        H_i, H_j, R = time_transfer(noise.time)
+        parts.append(Relation(over_states(H_i, where.clock, where.d), over_states(H_j, where.clock, where.d), R))
+    return together(*parts)

@@ -40,14 +40,33 @@ class PairTable(StrictTable):
     direction: Number | None = Field(
         None, description="standard deviation of the line of sight in rad; left out, none is measured"
     )
+    time: Number | None = Field(
+        None, description="standard deviation of the difference of the clocks; left out, none is measured"
+    )
+    H_i: Number | list[list[Number]] | None = Field(
+        None, description="any linear relation y = H_i x_i + H_j x_j + s: (p, d), of the observer's state"
+    )
+    H_j: Number | list[list[Number]] | None = Field(None, description="(p, d), of the other's state")
+    R: Number | list[list[Number]] | None = Field(None, description="(p, p) covariance of its noise s, or a number")
     none: Flag = Field(False, description="true: the two communicate and measure nothing of each other")
     both_ways: Flag = Field(True, description="whether the other measures the observer likewise, with noise of its own")
 
 
 class CooperativeTable(StrictTable):
-    """Agents that measure each other: relative range, line-of-sight direction, or both."""
+    """Agents that measure each other: relative range, line-of-sight direction, clocks, or any linear relation."""
 
-    positions: list[str] = Field(description="names of the 2 or 3 states that are the place")
+    positions: list[str] | None = Field(
+        None, description="names of the 2 or 3 states that are the place; needed for range and direction"
+    )
+    attitude: list[str] | None = Field(
+        None,
+        description="names of the state (in the plane: turned left) or 3 states (in space: small rotation about the "
+        "axes of the place), in rad, that turn an agent's own frame, in which it measures directions; left out: known",
+    )
+    clock: str | None = Field(None, description="name of the state that is the clock's error, for time")
+    time: Number | None = Field(
+        None, description="standard deviation of the difference of every pair's clocks, in the clock's unit"
+    )
     range: Number | None = Field(
         None, description="standard deviation of the distance of every pair, in the places' unit"
     )

@@ -183,6 +183,7 @@ def test_scenario_commands(tmp_path):
     listing = strict_json(run("scenario", "list", "-f", "json").stdout)
     assert [entry["name"] for entry in listing] == [
         "beacon-map",
+        "cooperative-attitude",
         "cooperative-pnt",
         "cv-2d",
         "fcs-demo",

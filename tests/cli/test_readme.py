@@ -60,6 +60,10 @@ def files(folder):
     text = everything()
     for content, name in re.findall(r"```toml\n(# (\S+\.toml)\n.*?)```", text, re.DOTALL):
         (folder / name).write_text(content)
+    for content, name in re.findall(r"```py\n(# (\S+\.py)\n.*?)```", text, re.DOTALL):
+        (folder / name).write_text(content)
+    for rules in HANDBOOK.glob("*.py"):
+        (folder / rules.name).write_text(rules.read_text(encoding="utf-8"))
     return folder
 
 

@@ -350,7 +350,10 @@ def test_interrupted_it_leaves_no_file(made, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("preset", "estimators"), [("cv-2d", ["naive", "optimal"]), ("cooperative-pnt", ["lwin"])])
+@pytest.mark.parametrize(
+    ("preset", "estimators"),
+    [("cv-2d", ["naive", "optimal"]), ("cooperative-pnt", ["lwin"]), ("gps-ins", ["equivalent-measurement"])],
+)
 @pytest.mark.parametrize("truth", [True, False])
 def test_nothing_in_the_figure_lies_on_another(preset, estimators, truth, tmp_path):
     s = sf.load_scenario(preset, steps=6)

@@ -177,6 +177,43 @@ def test_a_folder_with_such_files_is_not_written_over(tmp_path):
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
 
+def test_what_only_a_filter_of_its_own_knows_is_wrong_at_first_as_it_claims():
+    """A parallel filter's slip and offset: the estimate begins at 0, the truth about it."""
+    source = {
+        key: value for key, value in sf.load_scenario("parallel-filters").to_mapping().items() if key != "network"
+    }
+    source["network"] = {"agents": 3, "steps": 8, "hears": [[2, 3], [], []], "link": 0.5}
+    assert worst_z(sf.load_scenario(source), "joint-blender", 800) < 4.5
+
+
+def test_a_case_of_the_scenario_is_simulated_by_its_name(tmp_path):
+    lost = "fault: filter 2 lost from step 7"
+    found = sf.simulate("parallel-filters", 3, link=lost, estimator="blender")
+    assert found.heard[:, 0, 1].tolist() == [True] * 6 + [False] * 6
+    words = (
+        "simulate",
+        "parallel-filters",
+        "--runs",
+        "3",
+        "--estimator",
+        "blender",
+        "--format",
+        "json",
+        "--case",
+        lost,
+    )
+    assert json.loads(command(*words).stdout)["rows"][0]["realised"] == found.rows[0].realised
+    assert "--case: expected no --link beside it" in command(*words, "--link", "0.5", code=2).stderr
+    with pytest.raises(sf.UsageError, match="or --case with one of filter 1 alone, outputs arrive half the time"):
+        sf.simulate("parallel-filters")
+    with pytest.raises(sf.UsageError, match=r"case: expected one of filter 1 alone, .*, got 'fault'"):
+        sf.simulate("parallel-filters", link="fault")
+    with pytest.raises(
+        sf.UsageError, match=r"case: expected a scenario with \[\[network.case\]\], got none with a case"
+    ):
+        sf.simulate("thesis-steady", link="fault")
+
+
 def test_what_cannot_be_simulated_is_said():
     with pytest.raises(sf.UsageError, match="link: expected one link probability to simulate, got 5; give --link"):
         sf.simulate("thesis-steady")

@@ -18,14 +18,18 @@ import stochfuse
 from stochfuse.errors import UsageError
 from stochfuse.fusion.cooperative import (
     KINDS,
+    attitude,
     coincident,
     itns_update,
+    linear,
     lwin_update,
     observe,
     over_states,
     place,
     relation,
     residual,
+    time_transfer,
+    together,
 )
 from stochfuse.kalman.kernel import Estimate, update
 from stochfuse.scenario.checker import Checker
@@ -73,6 +77,115 @@ def test_jacobians_are_the_slopes_of_what_the_nodes_would_measure(kind, D, batch
     by_j = moved(lambda r: residual(kind, observe(kind, r_i, r), r_i, r_j), r_j)
     np.testing.assert_allclose(H_i, by_i, atol=1e-8)
     np.testing.assert_allclose(H_j, by_j, atol=1e-8)
+
+
+@pytest.mark.parametrize("batch", [(), (4,)])
+@pytest.mark.parametrize("D", [2, 3])
+@pytest.mark.parametrize("kind", KINDS)
+def test_attitude_is_the_slope_of_what_is_seen_from_a_turned_frame(kind, D, batch):
+    r_i, r_j = two_places(np.random.default_rng(D), D, *batch)
+
+    def seen(angles):
+        turned = np.concatenate([np.zeros(3 - len(angles)), angles])
+        C = Rotation.from_rotvec(turned).as_matrix()[:D, :D].T  # the vector in the axes of the frame that was turned
+        measured = observe(kind, r_i, r_j)
+        rest = measured[..., :1, :] if kind == "both" else measured[..., :0, :]
+        vector = measured if kind == "range" else C @ measured[..., -D:, :]
+        return residual(kind, np.concatenate([rest, vector], axis=-2), r_i, r_j)
+
+    expected = moved(seen, np.zeros(1 if D == 2 else 3))
+    found = attitude(kind, r_i, r_j)
+    assert found.shape == expected.shape
+    np.testing.assert_allclose(found, expected, atol=1e-7)
+
+
+def test_clocks_and_linear_relations_refuse_what_is_none():
+    np.testing.assert_array_equal(np.concatenate(time_transfer(0.5)), [[1], [-1], [0.25]])
+    for sigma in (0, -1, float("nan")):
+        with pytest.raises(UsageError, match=f"sigma: expected a positive standard deviation, got {sigma}"):
+            time_transfer(sigma)
+    with pytest.raises(
+        UsageError, match=r"expected shapes \(p, d_i\), \(p, d_j\) and \(p, p\), got \(1, 2\), \(2, 2\)"
+    ):
+        linear([[1, 0]], np.eye(2), 1.0)
+    for matrices in (([[1, 0]], [[0, 1]], [[-1]]), ([[np.inf, 0]], [[0, 1]], [[1]])):
+        with pytest.raises(UsageError, match="expected finite matrices and a covariance R"):
+            linear(*matrices)
+    both = together(relation("range", [[0, 0], [1, 1]], [3, 4], 2.0), linear([[1, 0]], [[0, 1]], [[9]]))
+    assert both.H_i.shape == (2, 2, 2)
+    np.testing.assert_array_equal(both.R, np.diag([4, 9]))
+
+
+TURNED = {
+    "schema": "stochfuse.scenario/1",
+    "model": {
+        "own": True, "states": ["x", "y", "h", "b"], "F": np.eye(4).tolist(), "Q": np.diag([0.2, 0.2, 1e-3, 0.5]).tolist(),
+        "H": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], "R": np.diag([4.0, 4, 9]).tolist(),
+    },
+    "initial": {"P": np.diag([50.0, 60, 0.02, 100]).tolist()},
+    "network": {"agents": 3, "steps": 3, "link": 1.0},
+    "cooperative": {
+        "positions": ["x", "y"], "attitude": ["h"], "clock": "b",
+        "pair": [
+            {"agents": [1, 2], "range": 1.0, "direction": 0.01, "time": 0.7},
+            {"agents": [3, 1], "direction": 0.02, "both_ways": False},
+            {"agents": [2, 3], "H_i": [[1, 0, 0, 2]], "H_j": [[0, -1, 0.5, 0]], "R": [[2.0]], "both_ways": False},
+        ],
+    },
+    "agent": [{"position": [0, 0]}, {"position": [30, 5], "sensor": False}, {"position": [[9, 20], [12, 22], [15, 20]]}],
+}  # fmt: skip
+
+
+def test_turned_frames_clocks_and_linear_relations_are_the_least_squares_of_the_whole_network():
+    """Every measurement of all steps at once, with slopes of the bearing in the observer's own frame."""
+    places = [np.array(agent["position"], float) for agent in TURNED["agent"]]
+    steps, n, d, rows = 3, 3, 4, []
+    # certain links: every run is the same
+    found = [stochfuse.predict(TURNED, None, "monte-carlo", q, estimator="itns", runs=2) for q in ("claimed", "actual")]
+
+    def at(step, node):
+        return slice((step * n + node) * d, (step * n + node + 1) * d)
+
+    def add(H_of, R):
+        H = np.zeros((len(R), steps * n * d))
+        for where, M in H_of:
+            H[:, where] += M
+        rows.append(H.T @ np.linalg.inv(R) @ H)
+
+    def bearing(i, j, step):
+        r = [p if p.ndim == 1 else p[step] for p in (places[i], places[j])]
+
+        def f(x):  # of both nodes' states
+            to = (r[1] + x[d : d + 2]) - (r[0] + x[:2])
+            return np.array([np.arctan2(to[1], to[0]) - x[2], np.hypot(*to), x[3] - x[d + 3]])
+
+        slopes = [(f(e) - f(-e)) / 2e-6 for e in 1e-6 * np.eye(2 * d)]
+        return np.stack(slopes, axis=1)
+
+    own, model = np.eye(d), TURNED["model"]
+    for step in range(steps):
+        for node in range(n):
+            if step == 0:
+                add([(at(0, node), own)], np.array(TURNED["initial"]["P"]))
+            else:
+                add([(at(step, node), own), (at(step - 1, node), -own)], np.array(model["Q"]))
+                if node != 1:
+                    add([(at(step, node), np.array(model["H"], float))], np.array(model["R"]))
+        for i, j, keep, R in (
+            (0, 1, [0, 1, 2], [1e-4, 1, 0.49]),
+            (1, 0, [0, 1, 2], [1e-4, 1, 0.49]),
+            (2, 0, [0], [4e-4]),
+        ):
+            J = bearing(i, j, step)[keep]
+            add([(at(step, i), J[:, :d]), (at(step, j), J[:, d:])], np.diag(R))
+        add([(at(step, 1), np.array([[1.0, 0, 0, 2]])), (at(step, 2), np.array([[0, -1, 0.5, 0]]))], np.array([[2.0]]))
+        # what later steps would tell is not known yet
+        P = np.linalg.inv(sum(rows)[: at(step, n).start, : at(step, n).start])
+        for node in range(n):
+            for prediction in found:
+                for k, name in enumerate("xyhb"):
+                    value = prediction.values(f"var:{name}", agent=node + 1)[0, step]
+                    assert value == pytest.approx(P[at(step, node), at(step, node)][k, k], rel=1e-6)
 
 
 @pytest.mark.parametrize("D", [2, 3])
@@ -530,6 +643,7 @@ def test_without_a_table_there_is_nothing():
 
 
 GOOD = {"positions": ["x", "y"], "range": 2.0}
+LINEAR = {"agents": [1, 2], "H_i": [[1, 0, 0]], "H_j": [[0, 0, 2]], "R": 3.0}
 DEVIATION = "expected a positive standard deviation"
 
 
@@ -581,7 +695,7 @@ DEVIATION = "expected a positive standard deviation"
         ),
         (
             {"pair": [{"agents": [1, 2]}]},
-            "cooperative.pair[1]: expected range, direction or none = true, got none of them",
+            "cooperative.pair[1]: expected range, direction, time, H_i with H_j and R, or none = true, got none of them",
         ),
         (
             {"pair": [{"agents": [1, 2], "none": True, "range": 1.0}]},
@@ -591,10 +705,65 @@ DEVIATION = "expected a positive standard deviation"
             {"pair": [{"agents": [1, 2], "range": 1.0}, {"agents": [2, 1], "none": True}]},
             "cooperative.pair[2].agents: expected every pair once, got [2, 1] again",
         ),
+        (
+            {"attitude": ["vx"]},
+            "cooperative.attitude: expected a direction that is measured in that frame, got none",
+        ),
+        (
+            {"attitude": ["vx", "x", "y"], "direction": 0.1},
+            "cooperative.attitude: expected the name of the state that turns an agent's frame, got ['vx', 'x', 'y']",
+        ),
+        (
+            {"attitude": ["h"], "direction": 0.1},
+            'cooperative.attitude[1]: expected one of "x", "vx", "y", got \'h\'',
+        ),
+        ({"time": 1.0}, "cooperative.clock: expected the name of the state that is the clock's error, got nothing"),
+        ({"clock": "vx"}, "cooperative.clock: expected a time that is measured, got none"),
+        ({"time": -1.0, "clock": "vx"}, f"cooperative.time: {DEVIATION}, got -1.0"),
+        (
+            {"pair": [{**LINEAR, "range": 1.0}]},
+            "cooperative.pair[1]: expected either H_i, H_j and R or another measurement, got both",
+        ),
+        (
+            {"pair": [{**LINEAR, "H_j": [[1, 0]]}]},
+            "cooperative.pair[1].H_j: expected a matrix of 1 row (of R) and 3 columns (of the states), got [[1, 0]]",
+        ),
+        ({"pair": [{**LINEAR, "R": [[-1.0]]}]}, "cooperative.pair[1].R: expected a covariance, got [[-1.0]]"),
     ],
 )
 def test_reading_names_what_is_wrong_in_the_table(changes, problem):
     assert read({**GOOD, **changes})[1] == [problem]
+
+
+def test_clocks_and_linear_relations_need_no_places():
+    relations, problems = read({"clock": "vx", "time": 0.5, "pair": [LINEAR]}, nodes=None)
+    assert (relations.positions, problems) == ((), [])
+    for pair, expected in (
+        ((0, 1), ([[1, 0, 0]], [[0, 0, 2]], [[3]])),
+        ((2, 1), ([[0, 1, 0]], [[0, -1, 0]], [[0.25]])),
+    ):
+        for M, of in zip(relations.pairs[pair], expected, strict=True):
+            np.testing.assert_array_equal(M, of)
+    assert len(relations.pairs) == 6
+    assert read({**GOOD, "pair": [{"agents": [1, 2], "H_i": [[1, 0, 0]], "R": 1.0}]})[1] == [
+        "cooperative.pair[1].H_j: expected a matrix beside the others of H_i, H_j and R, got nothing"
+    ]
+
+
+def test_small_angles_in_space_turn_what_is_seen():
+    states = ("x", "y", "z", "a", "b", "c")
+    table = {"positions": ["x", "y", "z"], "attitude": ["a", "b", "c"], "direction": 0.1}
+    nodes = [{"position": [0, 0, 0]}, {"position": [3, 4, 12]}]
+    relations, problems = read(table, nodes, 2, states=states)
+    assert not problems
+    H_i, H_j, _ = relations.pairs[0, 1]
+    # to turn about the line of sight is not seen; about anything else as far as the line of sight goes round
+    np.testing.assert_allclose(H_i[:, 3:] @ [3, 4, 12], 0, atol=1e-12)
+    assert np.linalg.norm(H_i[:, 3:] @ np.array([4, -3, 0]) / 5) == pytest.approx(1.0)
+    # turned left by φ, what moves left by distance times φ stays where it is seen
+    left = np.cross([0, 0, 1], [3, 4, 12])
+    np.testing.assert_allclose(H_i[:, 3:] @ [0, 0, 1] + H_j[:, :3] @ left, 0, atol=1e-12)
+    np.testing.assert_array_equal(H_j[:, 3:], 0)
 
 
 @pytest.mark.parametrize(
@@ -649,8 +818,9 @@ def test_coincident_agents_are_named_once_though_each_sees_the_other():
     "table",
     [
         {"positions": ["x", "y"], "rnage": 1.0},
-        {"range": 1.0},
         {"positions": ["x", "y"], "range": "1"},
+        {"positions": ["x", "y"], "attitude": "heading"},
+        {"clock": ["b"]},
         {"positions": ["x", "y"], "range": True},
         {"positions": ["x", "y"], "pair": [{"range": 1.0}]},
         {"positions": ["x", "y"], "pair": [{"agents": [1.0, 2], "range": 1.0}]},

@@ -27,7 +27,8 @@ from stochfuse.fusion.inertial import (
     error_model,
     noise_density,
 )
-from stochfuse.fusion.trajectory import Leg, Trajectory, trajectory
+from stochfuse.fusion.trajectory import Leg, Trajectory, geodetic, trajectory
+from stochfuse.fusion.trajectory import displaced as moved_on
 from stochfuse.kalman.kernel import Estimate, predict, update
 from stochfuse.scenario.checker import Checker
 from stochfuse.scenario.navigation import read_navigation
@@ -414,6 +415,26 @@ def test_legs_do_what_they_say(flown):
 def test_ways_that_cannot_be_taken(legs, given, message):
     with pytest.raises(UsageError, match=message):
         trajectory(legs, **{"speed": 60, "latitude": 0.5, **given})
+
+
+def test_geodetic_places_are_as_far_apart_as_the_way_is_long(flown):
+    def ecef(where):
+        L, λ, h = where.T
+        transverse = A / np.sqrt(1 - E2 * np.sin(L) ** 2)
+        across = (transverse + h) * np.cos(L)
+        return np.stack([across * np.cos(λ), across * np.sin(λ), ((1 - E2) * transverse + h) * np.sin(L)], axis=1)
+
+    path = flown
+    where = geodetic(path, 50)
+    gone = path.velocity[1:] + path.velocity[:-1]
+    ways = np.linalg.norm(np.diff(ecef(geodetic(path)), axis=0), axis=1)
+    np.testing.assert_allclose(ways, np.linalg.norm(gone, axis=1) / 2 * np.diff(path.time), rtol=1e-5)
+    L, λ, _ = where.T
+    north = np.stack([-np.sin(L) * np.cos(λ), -np.sin(L) * np.sin(λ), np.cos(L)], axis=1)
+    east = np.stack([-np.sin(λ), np.cos(λ), 0 * λ], axis=1)
+    up = np.cross(east, north)
+    moved = ecef(moved_on(where, np.tile([3.0, -5.0, 7.0], (len(where), 1)))) - ecef(where)
+    np.testing.assert_allclose(moved, 3 * north - 5 * east - 7 * up, atol=1e-4)
 
 
 def test_a_vehicle_comes_to_rest_and_stays():
