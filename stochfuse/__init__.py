@@ -19,13 +19,17 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from stochfuse.data.agent import Agent as Agent
+    from stochfuse.data.agent import Start as Start
     from stochfuse.data.crosscheck import Verdict as Verdict
     from stochfuse.data.crosscheck import check_results as check_results
     from stochfuse.data.crosscheck import crosscheck as crosscheck
+    from stochfuse.data.messages import MessageProtocol as MessageProtocol
     from stochfuse.data.results import read_results as read_results
     from stochfuse.data.run import RunResult as RunResult
     from stochfuse.data.run import run as run
     from stochfuse.data.simulate import simulate as simulate
+    from stochfuse.errors import MessageError as MessageError
     from stochfuse.errors import NoAnswerError as NoAnswerError
     from stochfuse.errors import ScenarioError as ScenarioError
     from stochfuse.errors import StochfuseError as StochfuseError
@@ -70,6 +74,7 @@ if TYPE_CHECKING:
     scenario: Room
 
 _HOME = {
+    "Agent": "data.agent",
     "AgentsNeeded": "questions.agents_needed",
     "Comparison": "prediction.compare",
     "Critical": "questions.critical",
@@ -77,13 +82,16 @@ _HOME = {
     "FusionGraph": "estimators.fusion_graph",
     "LeastLink": "questions.least_link",
     "LeastValue": "questions.least_value",
+    "MessageError": "errors",
     "MessageLoad": "questions.messages",
+    "MessageProtocol": "data.messages",
     "NoAnswerError": "errors",
     "Prediction": "prediction.result",
     "RunResult": "data.run",
     "Scenario": "scenario.scenario",
     "ScenarioError": "errors",
     "Sensitivity": "questions.sensitivity",
+    "Start": "data.agent",
     "StochfuseError": "errors",
     "Swept": "prediction.swept",
     "UsageError": "errors",
@@ -119,6 +127,7 @@ _HOME = {
 }
 
 __all__ = [
+    "Agent",
     "AgentsNeeded",
     "Comparison",
     "Critical",
@@ -126,13 +135,16 @@ __all__ = [
     "FusionGraph",
     "LeastLink",
     "LeastValue",
+    "MessageError",
     "MessageLoad",
+    "MessageProtocol",
     "NoAnswerError",
     "Prediction",
     "RunResult",
     "Scenario",
     "ScenarioError",
     "Sensitivity",
+    "Start",
     "StochfuseError",
     "Swept",
     "UsageError",

@@ -75,6 +75,8 @@ class RecursiveEstimator:
     """
 
     additive, joint = False, False
+    split = False
+    """Whether fusion asks what of an estimate only its own step's measurement brought."""
     symmetric: tuple[str, ...] = ()
     mixed: tuple[str, ...] = ()
 
