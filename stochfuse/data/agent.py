@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.data.knowledge import Knowledge, Latest, Measured, Setting, knowledge_of
+from stochfuse.data.knowledge import Knowledge, Latest, Setting, knowledge_of
 from stochfuse.data.messages import Kind, Life, MessageProtocol, Node, decode, encode
 from stochfuse.errors import MessageError, UsageError
 from stochfuse.estimators.making import make_for_data
@@ -274,9 +274,11 @@ class Agent:
             "now": knows.now,
             "begun": knows.begun,
         }
-        if isinstance(knows, Measured) and knows.base[0]:
-            step, (y, Y) = knows.base
-            nodes.append(Node(self._folded, step, {self._folded: step}, y, (Y,)))
+        for place, (vector, (step, information)) in enumerate(sorted(knows.worth.items(), key=lambda item: item[0])):
+            # as a node of nobody's, one step later than what it rests on
+            nobody = Life(self.scenario.network.agents, place)
+            known = {**dict(vector), nobody: step + 1}
+            nodes.append(Node(nobody, step + 1, known, information.y, (information.Y,)))
         if isinstance(knows, Latest):
             facts["seen"] = [[*life, sorted(steps)] for life, steps in sorted(knows.seen.items())]
         head = json.dumps(facts, separators=(",", ":")).encode()
@@ -313,20 +315,19 @@ class Agent:
         knows = self._knows
         knows.life = Life(self._setting.agent, secrets.randbelow(2**32 - 1) + 1)
         knows.now, knows.begun, knows.own = facts["now"], facts["begun"], nodes[0]
-        if isinstance(knows, Measured):
-            (_, nothing), base = knows.base, [node for node in nodes if node.life == self._folded]
-            knows.base = (0, Information(0.0 * nothing.y, 0.0 * nothing.Y))
-            for node in base:
-                knows.base = node.step, Information(node.v, node.M[0])
         if isinstance(knows, Latest):
             knows.seen = {Life(agent, number): set(steps) for agent, number, steps in facts["seen"]}
             nodes = nodes[1:]
-        knows.nodes = {node.name: node for node in nodes if node.life != self._folded}
-
-    @property
-    def _folded(self) -> Life:
-        """Under whose name the optimum's folded measurements are saved."""
-        return Life(self.scenario.network.agents, 0)
+        nobody = self.scenario.network.agents
+        knows.nodes = {node.name: node for node in nodes if node.life.agent != nobody}
+        knows.worth = {
+            tuple((life, k) for life, k in sorted(node.known.items()) if life.agent != nobody): (
+                node.step - 1,
+                Information(node.v, node.M[0]),
+            )
+            for node in nodes
+            if node.life.agent == nobody
+        }
 
     def _saved_kind(self) -> Kind:
         kind = self._setting.kind

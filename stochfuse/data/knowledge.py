@@ -23,6 +23,7 @@ others estimates.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -49,8 +50,16 @@ from stochfuse.scenario.registry import LFG, OPTIMAL, STAND_ALONE
 
 MOST_TERMS = 20_000
 """Intersections of one search of the graph; beyond, what is heard enters by covariance intersection."""
+MOST_SETS = 1_000
+"""Intersections of pedigrees that are worked out beforehand; where they are more, nothing is forgotten."""
 LIVES = 8
 """Lives of an agent that are told apart, on average."""
+
+
+Vector = tuple[tuple[Life, int], ...]
+"""The latest step of every life that a set of nodes holds."""
+Worth = tuple[int, Information]
+"""Step of a set's latest node, and what the set is worth there."""
 
 
 class Claim(NamedTuple):
@@ -123,6 +132,7 @@ class Knowledge:
     def __init__(self, setting: Setting, life: Life, step: int) -> None:
         self.setting, self.life, self.now, self.begun = setting, life, step, step
         self.nodes: dict[Name, Node] = {}
+        self.worth: dict[Vector, Worth] = {}
         self.own: Node
         self._claim: Claim | None = None
 
@@ -290,7 +300,7 @@ class Graph(Gossip):
         """Fuse(own ∪ heard); what that cannot be told of enters by covariance intersection, or waits."""
         arrived, own = self.arrived(), self.own
         held = [own, *(node for node in self.nodes.values() if node.step <= self.now and node is not own)]
-        search = _Search(self.setting, held, self.root)
+        search = self._search(held)
         mask, known, apart = search.mask(own.name), dict(own.known), []
         whole = mask
         for node in arrived:
@@ -326,17 +336,40 @@ class Graph(Gossip):
         return Estimate((own @ estimate.x + other @ x)[0], stack.C[0])
 
     def kept(self, common: dict[Life, int]) -> set[Name]:
-        """Nodes that a later search can meet."""
+        """Nodes that a later search can meet; what it can meet of sets within C is worked out once and for all."""
+        search = self._search(self.nodes.values())
         if not common:
             return set(self.nodes)
-        search = _Search(self.setting, list(self.nodes.values()), self.root)
-        below = search.below_all(common)
-        outside = ((1 << len(search.order)) - 1) & ~below
-        for place, name in enumerate(search.order):
-            if name not in self.nodes:
-                outside &= ~(1 << place)
-        met = search.pedigrees.reachable([below, below], outside)
-        return {name for place, name in enumerate(search.order) if met >> place & 1}
+        pedigrees, below = search.pedigrees, search.pedigrees.below
+        C = search.whole(common)
+        held = [place for place, name in enumerate(search.order) if name in self.nodes]
+        outside = [place for place in held if not C >> place & 1]
+        met = _intersections([C, *(below[place] for place in outside)])
+        inside = [mask for mask in met or () if not mask & ~C]
+        tops = {place for mask in inside for place in pedigrees.maximal(mask)}
+        worth = _intersections([*inside, *(below[place] for place in tops)])
+        if not met or not worth:
+            return set(self.nodes)  # too many to tell
+        known = {}
+        for mask in worth:
+            information = search.claimed(mask)
+            if information is not None:
+                known[search.vector(mask)] = search.latest(mask), information
+        self.worth = known
+        return {search.order[place] for place in (*outside, *tops)}
+
+    def _search(self, nodes: Iterable[Node]) -> _Search:
+        return _Search(self.setting, list(nodes), self.root, self.worth)
+
+
+def _intersections(sets: Iterable[int]) -> set[int]:
+    """Sets with all their intersections, but for the empty one; nothing if they are too many."""
+    found: set[int] = set()
+    for mask in set(sets):
+        found |= {mask, *(mask & other for other in found)}
+        if len(found) > MOST_SETS:
+            return set()
+    return found - {0}
 
 
 class UnknownError(Exception):
@@ -376,41 +409,60 @@ class _Sums:
 class _Search:
     """Pedigrees of nodes, and of those that they name but that are not held, as masks, earlier steps first."""
 
-    def __init__(self, setting: Setting, nodes: Sequence[Node], root: Information | None) -> None:
+    def __init__(
+        self, setting: Setting, nodes: Sequence[Node], root: Information | None, worth: Mapping[Vector, Worth]
+    ) -> None:
         held = {node.name: node for node in nodes}
-        named = {(life, k) for node in nodes for life, k in node.known.items()}
+        named = {name for node in nodes for name in node.known.items()} | {name for vector in worth for name in vector}
         origin: Name = (Life(len(setting.world.F), 0), 0)
         self.order = [origin] * (root is not None) + sorted(held.keys() | named, key=lambda name: name[::-1])
         self._place = {name: place for place, name in enumerate(self.order)}
-        sums, values, below = _Sums(setting.forward), [], []
-        last: dict[Life, int] = {}
-        for place, (life, step) in enumerate(self.order):
-            node, mask = held.get((life, step)), 1 << place
-            if place == 0 and root is not None:
-                values.append(sums.add(1, root))
+        self._origin = int(root is not None)
+        self._up_to: dict[Life, tuple[list[int], list[int]]] = {}
+        for place, (life, step) in enumerate(self.order[self._origin :], start=self._origin):
+            steps, masks = self._up_to.setdefault(life, ([], []))
+            steps.append(step)
+            masks.append((masks[-1] if masks else 0) | 1 << place)
+        self.sums = _Sums(setting.forward)
+        values, below = [], []
+        for name in self.order:
+            node = held.get(name)
+            below.append(self.whole(dict([name]) if node is None else node.known))
+            if name == origin and root is not None:
+                values.append(self.sums.add(1, root))
             else:
-                values.append(-1 if node is None else sums.add(step, Information(node.v, node.M[0])))
-                mask |= last.get(life, 1 if root is not None else 0)
-                for other, k in () if node is None else node.known.items():
-                    if other != life:
-                        mask |= below[self._place[other, k]]
-                last[life] = mask
-            below.append(mask)
-        self.sums = sums
-        self.pedigrees = Pedigrees(sums, values, below)  # pyright: ignore[reportArgumentType]
+                values.append(-1 if node is None else self.sums.add(node.step, Information(node.v, node.M[0])))
+        self.pedigrees = Pedigrees(self.sums, values, below)  # pyright: ignore[reportArgumentType]
         self.pedigrees.most = MOST_TERMS
+        for vector, (step, information) in worth.items():
+            self.pedigrees.know(self.whole(dict(vector)), self.sums.add(step, information))
 
     def mask(self, name: Name) -> int:
         """Pedigree of a node."""
         return self.pedigrees.below[self._place[name]]
 
-    def below_all(self, known: dict[Life, int]) -> int:
-        """Nodes that a vector holds."""
-        mask = 0
-        for place, (life, step) in enumerate(self.order):
-            if step <= known.get(life, 0):
-                mask |= 1 << place
+    def whole(self, known: Mapping[Life, int]) -> int:
+        """Nodes that a vector holds, as a mask."""
+        mask = self._origin
+        for life, step in known.items():
+            if life in self._up_to:
+                steps, masks = self._up_to[life]
+                at = bisect_right(steps, step)
+                mask |= masks[at - 1] if at else 0
         return mask
+
+    def vector(self, mask: int) -> Vector:
+        """The latest node of every life in a mask."""
+        latest: dict[Life, int] = {}
+        for place in range(self._origin, mask.bit_length()):
+            if mask >> place & 1:
+                life, step = self.order[place]
+                latest[life] = step
+        return tuple(sorted(latest.items()))
+
+    def latest(self, mask: int) -> int:
+        """Step of the latest node of a mask."""
+        return max(self.order[mask.bit_length() - 1][1], 1)
 
     def claimed(self, mask: int) -> Information | None:
         """Information of a pedigree; None where that cannot be told from what is held, or is no covariance's."""
@@ -431,7 +483,8 @@ class Measured(Gossip):
         super().__init__(setting, life, step)
         first, nothing = setting.first(), Information(*(0.0 * part for part in setting.first()))
         begins = setting.shared and step == 1
-        self.base: tuple[int, Information] = (1, first) if begins else (0, nothing)
+        # the one entry: what is folded, up to which step
+        self.worth = {(): (1, first) if begins else (0, nothing)}
         y, Y = nothing if begins else first
         self.own = Node(life, step, {life: step}, y, (Y,))
         self.nodes[self.own.name] = self.own
@@ -449,7 +502,7 @@ class Measured(Gossip):
 
     def new(self, nodes: Sequence[Node]) -> bool:
         """But for what comes after its step was folded."""
-        return super().new([node for node in nodes if node.step > self.base[0]])
+        return super().new([node for node in nodes if node.step > self.worth[()][0]])
 
     def fused(self) -> Claim:
         """One filter over all that is known."""
@@ -467,12 +520,12 @@ class Measured(Gossip):
             if agent != self.life.agent and (mine >= since or self.begun >= since):
                 last = min(last, mine)
         last = max(last, since - 1)
-        if last > self.base[0]:
-            self.base = self._filtered(last, self.own.known)
+        if last > self.worth[()][0]:
+            self.worth = {(): self._filtered(last, self.own.known)}
         return {n.name for n in self.nodes.values() if n.step > last or n.step > common.get(n.life, 0)}
 
     def _filtered(self, last: int, known: Mapping[Life, int]) -> tuple[int, Information]:
-        first, total = self.base
+        first, total = self.worth[()]
         by_step: dict[int, list[Node]] = {}
         for node in self.nodes.values():
             if first < node.step <= last and node.step <= known.get(node.life, 0):

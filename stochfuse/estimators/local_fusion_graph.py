@@ -114,6 +114,10 @@ class Pedigrees:
             self._known[mask] = known
         return known
 
+    def know(self, mask: int, value: int) -> None:
+        """Remember what a pedigree is worth, so that no search goes below it."""
+        self._known[mask] = value
+
     def reachable(self, known: Sequence[int], kept: int = 0) -> int:
         """Nodes that a later search can meet: given ones, and the maximal ones of any two pedigrees' intersection.
 
