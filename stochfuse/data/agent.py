@@ -37,7 +37,6 @@ from stochfuse.kalman.checks import covariance_fault
 from stochfuse.kalman.kernel import Estimate, Information, at_step
 from stochfuse.prediction.predict import choose
 from stochfuse.scenario import capabilities, registry
-from stochfuse.scenario.model import once
 from stochfuse.scenario.network import default_rows, reachable
 from stochfuse.scenario.scenario import Scenario, ScenarioLike, load_scenario
 
@@ -50,7 +49,7 @@ class Start(NamedTuple):
     Parameters
     ----------
     step : of its first estimate.
-    x, P : (d,) and (d, d) first estimate; default: the scenario's.
+    x, P : (d,) and (d, d) first estimate; default: the scenario's, x from initial.x or where its nominal path begins.
     """
 
     step: int = 1
@@ -341,9 +340,10 @@ class Live:
     def __init__(self, scenario: Scenario, agent: int, start: Start) -> None:
         system = scenario.system
         still = [np.zeros((1, 1, 1)) for _ in range(system.agents)]
-        first = None if start.x is None else np.asarray(start.x, dtype=float).reshape(1, -1, 1)
+        first = start.x if scenario.nominal is None or system.x0.any() or start.x is not None else scenario.nominal[0]
+        first = None if first is None else np.asarray(first, dtype=float).reshape(1, -1, 1)
         self._readings = Readings.given(system, still, first=[first] * system.agents)
-        self._inputs = once(self._readings.inputs)
+        self._inputs = self._readings.inputs if system.model.varies else self._readings.inputs[0]
         self.function = scenario.instruments[agent] if scenario.instruments else None
         self._z = self._H = None
 

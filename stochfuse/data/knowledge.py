@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.data.messages import FORGOTTEN, Kind, Life, MessageProtocol, Name, Node, smallest
+from stochfuse.data.messages import LIVES, Kind, Life, MessageProtocol, Name, Node, smallest
 from stochfuse.errors import MessageError, NoAnswerError, TooManyError, UsageError
 from stochfuse.estimators.local_fusion_graph import Pedigrees
 from stochfuse.estimators.recursion import Pasts, RecursiveEstimator, Worked, worked_out
@@ -52,8 +52,6 @@ MOST_TERMS = 20_000
 """Intersections of one search of the graph; beyond, what is heard enters by covariance intersection."""
 MOST_SETS = 1_000
 """Intersections of pedigrees that are worked out beforehand; where they are more, nothing is forgotten."""
-LIVES = 8
-"""Lives of an agent that are told apart, on average."""
 
 
 Vector = tuple[tuple[Life, int], ...]
@@ -166,9 +164,12 @@ class Knowledge:
             node.step > first.step or k > first.known.get(life, 0) for node in nodes for life, k in node.known.items()
         ):
             raise MessageError("message: expected nodes that its first one rests on, got others")
-        lives = {life for node in (*self.nodes.values(), *nodes) for life in node.known}
-        if len(lives) > LIVES * self.setting.world.agents:
-            raise MessageError(f"message: expected at most {LIVES} lives of an agent, got more")
+        known, told = set(self.own.known), {life for node in nodes for life in node.known}
+        for life in told - known:
+            if sum(life.agent == other.agent for other in known | told) > LIVES:
+                raise MessageError(
+                    f"message: expected {LIVES} lives of agent {life.agent + 1} at most, which are told apart, got more"
+                )
         if first.step < self.now - protocol.horizon:
             return False
         new = self.new([node for node in nodes if node.step >= self.now - protocol.horizon])
@@ -253,8 +254,7 @@ class Gossip(Knowledge):
 
     def _step(self, claim: Claim, v: np.ndarray, M: np.ndarray) -> None:
         """Put down the agent's own node of this step."""
-        old = self.now - FORGOTTEN
-        known = {life: k for life, k in claim.known.items() if k >= old} | {self.life: self.now}
+        known = {**claim.known, self.life: self.now}
         self._claim = None
         self.own = self.nodes[self.life, self.now] = Node(self.life, self.now, known, v, (M,))
         self._forget()

@@ -39,8 +39,8 @@ HEAD, SUM = struct.Struct("<2sBBIHHIHH"), struct.Struct("<I")
 LATEST_STEP, LARGEST = 2**32 - 1, 1e150
 CARRIES = ("full", "acknowledged", "own", "window")
 MISSING = ("intersect", "wait")
-MOST_HORIZON, FORGOTTEN = 500, 1000
-"""Largest horizon, and steps after which a life that was not heard of any more is left out of pedigrees."""
+MOST_HORIZON, LIVES = 500, 64
+"""Largest horizon, and lives of an agent that are told apart; what comes of later ones is refused."""
 
 
 class Life(NamedTuple):
@@ -194,7 +194,7 @@ def decode(data: Any, kind: Kind) -> list[Node]:
         _refuse(f"{len(kind.dimensions)} agents with estimator {kind.estimator}", "another network's or estimator's")
     width = d + matrices * d * (d + 1) // 2
     least = HEAD.size + 3 * B + N * (1 + B + 8 * width) + SUM.size
-    if not 1 <= N <= kind.most or not 1 <= B <= N * agents + agents or len(data) < least or not d:
+    if not 1 <= N <= kind.most or not 1 <= B <= LIVES * agents or len(data) < least or not d:
         _refuse(f"1 to {kind.most} nodes that fit into {len(data)} bytes", f"{N} of {B} lives")
     reader = _Reader(data, HEAD.size, len(data) - SUM.size)
     latest = {Life(reader.next(), reader.next()): reader.next() for _ in range(B)}
@@ -228,15 +228,14 @@ def _pedigrees(reader: _Reader, nodes: int, latest: Mapping[Life, int]) -> tuple
         _refuse("nodes that rest on earlier ones", "steps out of order")
     complete = True
     for life in range(len(lives)):
-        # whoever knows a node knows what that rests on, but for what is long over
+        # whoever knows a node knows what that rests on
         mine = np.flatnonzero(whose == life)
         mine = mine[np.argsort(steps[mine], kind="stable")]
         latest_known = known[:, life] - (whose == life)
         at = np.searchsorted(steps[mine], latest_known, side="right") - 1
         there = np.flatnonzero(at >= 0)
         below = known[mine[at[there]]]
-        lacks = (below > known[there]) & (below >= steps[there, None] - FORGOTTEN)
-        complete &= not lacks.any()
+        complete &= not (below > known[there]).any()
     names = [(lives[life], step) for life, step in zip(whose.tolist(), steps.tolist(), strict=True)]
     if not complete or len(set(names)) < nodes:
         _refuse("pedigrees that hold what they rest on", "others")
@@ -316,7 +315,7 @@ def _write(out: bytearray, *numbers: int) -> None:
 
 def _longest(kind: Kind) -> int:
     """Bytes that the longest message cannot reach."""
-    d, lives = max(kind.dimensions), 8 * len(kind.dimensions)
+    d, lives = max(kind.dimensions), LIVES * len(kind.dimensions)
     return HEAD.size + 15 * lives + kind.most * (10 + 5 * lives + 8 * (d + kind.matrices * d * (d + 1) // 2)) + 5
 
 
