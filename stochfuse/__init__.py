@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from stochfuse.data.crosscheck import check_results as check_results
     from stochfuse.data.crosscheck import crosscheck as crosscheck
     from stochfuse.data.messages import MessageProtocol as MessageProtocol
+    from stochfuse.data.protocols import ProtocolLoad as ProtocolLoad
+    from stochfuse.data.protocols import protocol_load as protocol_load
     from stochfuse.data.results import read_results as read_results
     from stochfuse.data.run import RunResult as RunResult
     from stochfuse.data.run import run as run
@@ -87,6 +89,7 @@ _HOME = {
     "MessageProtocol": "data.messages",
     "NoAnswerError": "errors",
     "Prediction": "prediction.result",
+    "ProtocolLoad": "data.protocols",
     "RunResult": "data.run",
     "Scenario": "scenario.scenario",
     "ScenarioError": "errors",
@@ -117,6 +120,7 @@ _HOME = {
     "predict": "prediction.predict",
     "predict_many": "prediction.predict",
     "predict_states": "prediction.states",
+    "protocol_load": "data.protocols",
     "read_results": "data.results",
     "run": "data.run",
     "sensitivity": "questions.sensitivity",
@@ -140,6 +144,7 @@ __all__ = [
     "MessageProtocol",
     "NoAnswerError",
     "Prediction",
+    "ProtocolLoad",
     "RunResult",
     "Scenario",
     "ScenarioError",
@@ -171,6 +176,7 @@ __all__ = [
     "predict",
     "predict_many",
     "predict_states",
+    "protocol_load",
     "read_results",
     "run",
     "scenario",

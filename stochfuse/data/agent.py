@@ -185,9 +185,11 @@ class Agent:
                 f"{where}: expected {self._last} steps at most, the scenario's matrices depend on the step"
             )
         H = at_step(self._setting.world.H[self._setting.agent], step)
+        if self._live is None:
+            self._knows.go_on(not H.any())
+            return
         measured = self._measured(z, H, where)
-        if self._live is not None:
-            self._live.meet(measured)
+        self._live.meet(measured)
         if measured is None and H.any():
             why = capabilities.not_on_data(self.estimator, [capabilities.GAPS])
             if why is not None:
@@ -260,6 +262,16 @@ class Agent:
     def claimed(self) -> Estimate:
         """Return the same as it is carried along, x of shape (d, columns)."""
         return self._knows.claim().estimate
+
+    @property
+    def apart(self) -> int:
+        """How many estimates that were heard rest on others that are not there, see `MessageProtocol.missing`."""
+        return self._knows.claim().apart
+
+    @property
+    def kind(self) -> Kind:
+        """What all messages of its network have in common."""
+        return self._setting.kind
 
     def save(self) -> bytes:
         """Return all that it needs to go on from here; see `load`."""

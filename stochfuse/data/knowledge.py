@@ -15,9 +15,10 @@ An agent that was not heard of for `horizon` steps is not waited for, and nodes 
 n · (horizon + 1) nodes are held (twice that while messages from agents whose clocks are ahead wait).
 
 **What that costs.**  Nothing as long as no agent is silent for longer.  After a longer silence nodes may be missing
-that two pedigrees have in common.  The Graph then takes their common information for unknown: the estimate enters by
-covariance intersection, cautiously, or waits (`MessageProtocol.missing`); what follows rests on it, and is exact again
-as soon as both sides hold what they share.  The optimum loses measurements that come later than that, and so do the
+that two pedigrees have in common.  The Graph then takes their common information for unknown: the estimate waits until
+what is missing comes, or enters by covariance intersection (`MessageProtocol.missing`; always if nothing of its agent
+was fused for longer than the horizon, for then nobody may hold what is missing).  What follows rests on it, and is
+exact again as soon as both sides hold what they share.  The optimum loses measurements that come later than that, and so do the
 others estimates.
 """
 
@@ -26,11 +27,12 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.data.messages import LIVES, Kind, Life, MessageProtocol, Name, Node, smallest
+from stochfuse.data.messages import LIVES, Kind, Life, MessageProtocol, Name, Node
 from stochfuse.errors import MessageError, NoAnswerError, TooManyError, UsageError
 from stochfuse.estimators.local_fusion_graph import Pedigrees
 from stochfuse.estimators.recursion import Pasts, RecursiveEstimator, Worked, worked_out
@@ -61,11 +63,12 @@ Worth = tuple[int, Information]
 
 
 class Claim(NamedTuple):
-    """What an agent claims, in either form, and the pedigree that it rests on."""
+    """What an agent claims, in either form, the pedigree that it rests on, and how many estimates did not fit in."""
 
     estimate: Estimate
     known: dict[Life, int]
     information: Information | None = None
+    apart: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +92,11 @@ class Setting:
     protocol: MessageProtocol
     shared: bool = False
 
+    @cached_property
+    def _invertible(self) -> np.ndarray:
+        """Whether F has an inverse, of every step where it depends on that."""
+        return np.atleast_1d(np.linalg.cond(self.world.F[self.agent]) < 1e8)
+
     @property
     def rows(self) -> slice:
         """Where its state is in the stacked one."""
@@ -102,7 +110,7 @@ class Setting:
     def forward(self, information: Information, step: int) -> Information:
         """Time update of an information pair to a step."""
         F, Q, moved = self.transition(step)
-        if np.linalg.cond(F) < 1e8:
+        if self._invertible[step - 1 if self.world.F[self.agent].ndim > 2 else 0]:
             return predict_information(information, F, Q, moved)
         return to_information(predict(from_information(information), F, Q, moved))
 
@@ -305,9 +313,10 @@ class Graph(Gossip):
         whole = mask
         for node in arrived:
             whole |= search.mask(node.name)
-        told = search.claimed(whole) is not None
+        if search.claimed(whole) is not None:
+            mask = whole
         for node in arrived:
-            more = whole if told else mask | search.mask(node.name)
+            more = mask | search.mask(node.name)
             if more != mask and search.claimed(more) is None:
                 apart.append(node)
                 continue
@@ -315,13 +324,19 @@ class Graph(Gossip):
             _join(known, node.known)
         information = search.claimed(mask) or Information(own.v, own.M[0])
         apart = [n for n in apart if not any(n is not o and n.step <= o.known.get(n.life, 0) for o in apart)]
-        if not apart or self.setting.protocol.missing == "wait":
-            return Claim(from_information(information), known, information)
+        meet = [node for node in apart if self.setting.protocol.missing == "intersect" or self._silent(node.life.agent)]
+        if not meet:
+            return Claim(from_information(information), known, information, len(apart))
         estimate = from_information(information)
-        for node in apart:
+        for node in meet:
             estimate = self._intersected(estimate, node)
             _join(known, node.known)
-        return Claim(estimate, known, to_information(estimate))
+        return Claim(estimate, known, to_information(estimate), len(apart))
+
+    def _silent(self, agent: int) -> bool:
+        """Whether nothing of an agent was fused for longer than the horizon."""
+        latest = max((k for life, k in self.own.known.items() if life.agent == agent), default=self.begun)
+        return latest < self.now - self.setting.protocol.horizon
 
     def _intersected(self, estimate: Estimate, node: Node) -> Estimate:
         information = Information(node.v, node.M[0])
@@ -469,11 +484,10 @@ class _Search:
         try:
             value = self.pedigrees.fuse(mask)
             information = self.sums.at(value, self.sums.step[value])
+            np.linalg.cholesky(information.Y)
         except (UnknownError, TooManyError, np.linalg.LinAlgError):
             return None
-        Y = information.Y[None]
-        fine = np.isfinite(information.Y).all() and np.isfinite(information.y).all() and smallest(Y)[0] > 0
-        return information if fine else None
+        return information if np.isfinite(information.y).all() else None
 
 
 class Measured(Gossip):

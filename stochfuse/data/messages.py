@@ -38,7 +38,7 @@ MAGIC, VERSION = b"SF", 1
 HEAD, SUM = struct.Struct("<2sBBIHHIHH"), struct.Struct("<I")
 LATEST_STEP, LARGEST = 2**32 - 1, 1e150
 CARRIES = ("full", "acknowledged", "own", "window")
-MISSING = ("intersect", "wait")
+MISSING = ("wait", "intersect")
 MOST_HORIZON, LIVES = 500, 64
 """Largest horizon, and lives of an agent that are told apart; what comes of later ones is refused."""
 
@@ -112,13 +112,14 @@ class MessageProtocol:
     window : steps, this one included.
     horizon : steps after which an agent that was not heard of is no longer waited for, and nodes are forgotten.
     missing : what is done with a node whose common information with what is known rests on nodes that are not there:
-        "intersect": fused by covariance intersection, as if nothing were known of it; "wait": left until they come.
+        "wait": it is left until they come, unless nothing of its agent was fused for longer than the horizon; else, and
+        with "intersect" at once: it is fused by covariance intersection, as if nothing were known of it.
     """
 
     carries: str = "acknowledged"
     window: int = 0
     horizon: int = 32
-    missing: str = "intersect"
+    missing: str = "wait"
 
     def __post_init__(self) -> None:
         for name, value, names in (("carries", self.carries, CARRIES), ("missing", self.missing, MISSING)):
