@@ -18,8 +18,8 @@ n · (horizon + 1) nodes are held (twice that while messages from agents whose c
 that two pedigrees have in common.  The Graph then takes their common information for unknown: the estimate waits until
 what is missing comes, or enters by covariance intersection (`MessageProtocol.missing`; always if nothing of its agent
 was fused for longer than the horizon, for then nobody may hold what is missing).  What follows rests on it, and is
-exact again as soon as both sides hold what they share.  The optimum loses measurements that come later than that, and so do the
-others estimates.
+exact again as soon as both sides hold what they share.  The optimum loses measurements that come later than that, and
+so do the others estimates.
 """
 
 from __future__ import annotations

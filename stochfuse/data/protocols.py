@@ -190,7 +190,7 @@ def protocol_load(
     if system.detects is not None:
         raise UsageError("sensor.detection: expected sensors that do not miss for loads of live agents")
     world, seen = world_of(system), np.zeros((runs, system.steps, system.agents), dtype=bool)
-    records = [drawn_arrivals(system, rows.take([row]), seen, seed) for row in range(len(rows.link))]
+    records = [drawn_arrivals(system, rows.take(np.array([row])), seen, seed) for row in range(len(rows.link))]
     made = _Network(scenario, estimator, world, Footprints(world), len(policies) * len(records) * runs)
     lived = [[made.lived(policy, record) for record in records] for policy in policies]
     stacked = tuple(Lived(*(np.stack(part) for part in zip(*each, strict=True))) for each in lived)
