@@ -18,8 +18,10 @@ from stochfuse.data.records import arrivals_of
 from stochfuse.engines.replay import replay
 from stochfuse.estimators.protocol import Late
 from stochfuse.estimators.readings import Readings
+from stochfuse.questions.messages import in_bytes
 from stochfuse.scenario import capabilities, registry
 from stochfuse.scenario.registry import GENERAL
+from tests.data import udp
 
 F, Q = [[1.0, 0.5], [0.0, 0.8]], [[0.5, 0.1], [0.1, 0.4]]
 H, R, P0 = [[1.0, 0.3]], [[0.8]], [[2.0, 0.3], [0.3, 1.0]]
@@ -377,6 +379,24 @@ def test_who_joins_late_is_an_independent_source():
     together, cov = one.fuse()
     np.testing.assert_allclose(np.linalg.inv(cov), Y, rtol=1e-12)
     np.testing.assert_allclose(Y @ together, np.linalg.inv(P) @ x + [0.0, 1 / 9], rtol=1e-10)
+
+
+@pytest.mark.slow
+def test_three_processes_that_talk_udp_send_and_claim_what_is_predicted():
+    """200 steps, every other message lost; the prediction is of steps 11 to 16, which are as good as any later one."""
+    found = udp.together(0.5, 200)
+    s = udp.scenario(16)
+    heard = np.mean([each["heard"] for each in found])
+    assert abs(heard - 1.0) < 5 * np.sqrt(2 * 0.25 / (3 * 190))
+    claimed = sf.predict(s, [0.5], "monte-carlo", estimator="local-fusion-graph", runs=60)
+    expected, error = (each[0, 10:].mean() for each in (claimed.values("var:x1"), claimed.standard_error("var:x1")))
+    assert abs(np.mean([each["claimed"] for each in found]) - expected) < 4 * error + 0.03 * expected
+    assert 0.5 < np.mean([each["square"] for each in found]) / expected < 1.6
+    load, number = (sf.message_load(s, [0.5], rule).between(11, 16) for rule in ("local-fusion-graph", "naive"))
+    least = in_bytes(load, number, header=33).mean[0]
+    assert least < np.mean([each["bytes"] for each in found]) < 5 * least
+    assert max(each["most_held"] for each in found) <= 3 * 33
+    assert max(each["longest"] for each in found) < 3 * 33 * 44
 
 
 @pytest.mark.parametrize("numbers", [[0], [1, 127, 128, 300, 2**32 - 1]])
