@@ -126,22 +126,24 @@ class Agent:
 
     def _set(self, protocol: MessageProtocol, world: World, riding: Riding, agent: int, start: Start) -> None:
         system, name = self.scenario.system, self.estimator
+        entry = registry.estimator(name)
         capabilities.require(system, default_rows(system.network), name, registry.GENERAL)
         why = capabilities.not_live(name, system)
         if why is not None:
             raise UsageError(why)
-        made = None if registry.estimator(name).sums else make_for_data(system, name, self.criterion)
+        made = None if entry.sums else make_for_data(system, name, self.criterion)
         if isinstance(made, RecursiveEstimator):
             made.world = world
         sizes, n = tuple(rows.stop - rows.start for rows in world.states), system.agents
         matrices = 2 if getattr(made, "split", False) else 1
-        kind = Kind(name, sizes, matrices, name != registry.OPTIMAL, n * 2 * (protocol.horizon + 1))
+        definite = (entry.sums or entry.weighs) and name != registry.OPTIMAL
+        kind = Kind(name, sizes, matrices, definite, n * 2 * (protocol.horizon + 1))
         shared = system.shared and start.step == 1 and start.P is None
         self._setting = Setting(world, agent, riding, kind, protocol, shared)
         late = capabilities.reason(name, registry.GENERAL, "delay") is None
         self._knows: Knowledge = knowledge_of(self._setting, Life(agent, 0), start.step, made, late)
         varies = system.model.varies or any(sensor.varies for sensor in system.sensors)
-        bounded = varies or bool(self.scenario.instruments) or registry.estimator(name).own_filters
+        bounded = varies or bool(self.scenario.instruments) or entry.own_filters
         self._last = system.steps if bounded else None
 
     @property
@@ -309,7 +311,7 @@ class Agent:
         MessageError
             If it is not that.
         """
-        whole, check = bytes(data[:-4]), bytes(data[-4:])
+        whole, check = (bytes(data[:-4]), bytes(data[-4:])) if isinstance(data, bytes | bytearray) else (b"", b"")
         if whole[:4] != SAVED or zlib.crc32(whole).to_bytes(4, "little") != check:
             raise MessageError("saved agent: expected what Agent.save returned, got other or damaged bytes")
         end = 8 + int.from_bytes(whole[4:8], "little")
@@ -357,6 +359,7 @@ class Live:
         self._readings = Readings.given(system, still, first=[first] * system.agents)
         self._inputs = self._readings.inputs if system.model.varies else self._readings.inputs[0]
         self.function = scenario.instruments[agent] if scenario.instruments else None
+        self._widths = [H.shape[-2] for H in self._readings.world.H]
         self._z = self._H = None
 
     def meet(self, z: np.ndarray | None) -> None:
@@ -376,10 +379,8 @@ class Live:
         return H if self._H is None else self._H
 
     def measured(self, step: int, agent: int) -> np.ndarray:
-        """The measurement."""
-        if self._z is None:
-            raise ValueError("expected a measurement")
-        return self._z
+        """The measurement; anything where H is zero."""
+        return np.zeros((self._widths[agent], 1)) if self._z is None else self._z
 
     def related(self, step: int, pair: tuple[int, int]) -> np.ndarray:
         """That all track one state."""

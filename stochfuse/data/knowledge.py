@@ -19,7 +19,8 @@ that two pedigrees have in common.  The Graph then takes their common informatio
 what is missing comes, or enters by covariance intersection (`MessageProtocol.missing`; always if nothing of its agent
 was fused for longer than the horizon, for then nobody may hold what is missing).  What follows rests on it, and is
 exact again as soon as both sides hold what they share.  The optimum loses measurements that come later than that, and
-so do the others estimates.
+so do the others estimates.  The same may happen without silence among more than a dozen agents that hear most of what
+all say, whose pedigrees have too many intersections to work out.
 """
 
 from __future__ import annotations
@@ -52,8 +53,8 @@ from stochfuse.scenario.registry import LFG, OPTIMAL, STAND_ALONE
 
 MOST_TERMS = 20_000
 """Intersections of one search of the graph; beyond, what is heard enters by covariance intersection."""
-MOST_SETS = 1_000
-"""Intersections of pedigrees that are worked out beforehand; where they are more, nothing is forgotten."""
+MOST_SETS = 4_000
+"""Intersections of pedigrees that are worked out beforehand; where they are more, the horizon alone forgets."""
 
 
 Vector = tuple[tuple[Life, int], ...]

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -289,21 +289,6 @@ class _Reader:
             if byte < 128:
                 return value if value <= LATEST_STEP else _refuse("numbers of 32 bits", value)
         return _refuse("whole varints", "one that does not end")
-
-
-def read_varints(data: bytes) -> list[int]:
-    """Return what `write_varints` wrote."""
-    reader, out = _Reader(data, 0, len(data)), []
-    while reader.place < reader.end:
-        out.append(reader.next())
-    return out
-
-
-def write_varints(numbers: Iterable[int]) -> bytes:
-    """Return the bytes of some numbers below 2³²."""
-    out = bytearray()
-    _write(out, *numbers)
-    return bytes(out)
 
 
 def _write(out: bytearray, *numbers: int) -> None:

@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import stochfuse as sf
-from stochfuse.data import messages
 from stochfuse.data.draw import drawn
 from stochfuse.data.records import arrivals_of
 from stochfuse.engines.replay import replay
@@ -20,8 +19,10 @@ from stochfuse.estimators.protocol import Late
 from stochfuse.estimators.readings import Readings
 from stochfuse.questions.messages import in_bytes
 from stochfuse.scenario import capabilities, registry
+from stochfuse.scenario.network import reachable
 from stochfuse.scenario.registry import GENERAL
 from tests.data import udp
+from tests.oracles.featured import source as featured
 
 F, Q = [[1.0, 0.5], [0.0, 0.8]], [[0.5, 0.1], [0.1, 0.4]]
 H, R, P0 = [[1.0, 0.3]], [[0.8]], [[2.0, 0.3], [0.3, 1.0]]
@@ -168,6 +169,45 @@ def forward(P, steps):
     for _ in range(steps):
         P = np.array(F) @ P @ np.array(F).T + np.array(Q)
     return P
+
+
+FEATURES = [f.name for f in capabilities.FEATURES if f.name not in ("detection", "bursts", "cases", "own-states")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("architecture", ["ad-hoc", "cyclic"])
+@pytest.mark.parametrize("name", LIVE)
+def test_every_feature_that_the_table_takes_is_taken_live(name, architecture):
+    """Known inputs among them."""
+    for number, feature in enumerate([*FEATURES, "input"]):
+        if feature != "input" and capabilities.reason(name, GENERAL, feature) is not None:
+            continue
+        made = featured([] if feature == "input" else [feature])
+        made["network"] = {**made["network"], **({"architecture": architecture} if feature != "masks" else {})}
+        if feature == "input":
+            d = len(np.atleast_2d(made["model"]["F"]))
+            made["model"] = {**made["model"], "B": np.eye(d).tolist(), "u": list(range(1, d + 1))}
+        try:
+            s = sf.load_scenario(made)
+            agents = [sf.Agent(s, i + 1, name) for i in range(s.network.agents)]
+        except (sf.UsageError, sf.ScenarioError):
+            continue  # what the estimator or the scenario itself refuses, or filters that have no common input
+        rng, steps, there = np.random.default_rng(number), s.network.steps, reachable(s.network)
+        came = [(k, i, j, 0) for k in range(1, steps + 1) for i, j in np.argwhere(there).tolist() if rng.random() < 0.6]
+        H = [s.system.sensors[kind].H for kind in s.system.sensor_of]
+        z = [rng.normal(size=(1, steps, each.shape[1])) for each in H]
+        missed = np.zeros((1, steps, len(agents)), dtype=bool)
+        for k, stage in enumerate(replayed(s, name, came, missed, z), start=1):
+            for i, agent in enumerate(agents if k > 1 else []):
+                agent.step(z[i][0, k - 1] if H[i][k - 1].any() else None)
+            said = [agent.message() for agent in agents]
+            for sent, i, j, _ in came:
+                if sent == k:
+                    agents[i].receive(said[j])
+            for estimate, agent in zip(stage, agents, strict=True):
+                x, P = agent.fuse()
+                np.testing.assert_allclose(P, estimate.P[0], rtol=1e-7, atol=1e-9, err_msg=feature)
+                np.testing.assert_allclose(x, estimate.x[0, :, 0], rtol=1e-6, atol=1e-7, err_msg=feature)
 
 
 def exchanged(name="local-fusion-graph", steps=6, agents=3, protocol="acknowledged", seed=1):
@@ -397,8 +437,3 @@ def test_three_processes_that_talk_udp_send_and_claim_what_is_predicted():
     assert least < np.mean([each["bytes"] for each in found]) < 5 * least
     assert max(each["most_held"] for each in found) <= 3 * 33
     assert max(each["longest"] for each in found) < 3 * 33 * 44
-
-
-@pytest.mark.parametrize("numbers", [[0], [1, 127, 128, 300, 2**32 - 1]])
-def test_varints(numbers):
-    assert messages.read_varints(messages.write_varints(numbers)) == numbers
