@@ -286,6 +286,7 @@ class Agent:
             "protocol": asdict(self.protocol),
             "now": knows.now,
             "begun": knows.begun,
+            "waived": [[*life, step] for life, step in sorted(knows.waived.items())],
         }
         for place, (vector, (step, information)) in enumerate(sorted(knows.worth.items(), key=lambda item: item[0])):
             # as a node of nobody's, one step later than what it rests on
@@ -328,6 +329,7 @@ class Agent:
         knows = self._knows
         knows.life = Life(self._setting.agent, secrets.randbelow(2**32 - 1) + 1)
         knows.now, knows.begun, knows.own = facts["now"], facts["begun"], nodes[0]
+        knows.waived = {Life(agent, number): step for agent, number, step in facts["waived"]}
         if isinstance(knows, Latest):
             knows.seen = {Life(agent, number): set(steps) for agent, number, steps in facts["seen"]}
             nodes = nodes[1:]

@@ -16,11 +16,11 @@ n · (horizon + 1) nodes are held (twice that while messages from agents whose c
 
 **What that costs.**  Nothing as long as no agent is silent for longer.  After a longer silence nodes may be missing
 that two pedigrees have in common.  The Graph then takes their common information for unknown: the estimate waits until
-what is missing comes, or enters by covariance intersection (`MessageProtocol.missing`; always if nothing of its agent
-was fused for longer than the horizon, for then nobody may hold what is missing).  What follows rests on it, and is
-exact again as soon as both sides hold what they share.  The optimum loses measurements that come later than that, and
-so do the others estimates.  The same may happen without silence among more than a dozen agents that hear most of what
-all say, whose pedigrees have too many intersections to work out.
+what is missing comes, or enters by covariance intersection (`MessageProtocol.missing`; always if what is missing is
+older than the horizon, or was done without before).  What follows rests on it, and is exact again
+as soon as both sides hold what they share.  The optimum loses measurements that come later than that, and so do the
+others estimates.  The same may happen without silence among more than a dozen agents that hear most of what all say,
+whose pedigrees have too many intersections to work out.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -64,12 +65,21 @@ Worth = tuple[int, Information]
 
 
 class Claim(NamedTuple):
-    """What an agent claims, in either form, the pedigree that it rests on, and how many estimates did not fit in."""
+    """What an agent claims.
+
+    Parameters
+    ----------
+    estimate, information : in either form.
+    known : the pedigree that it rests on.
+    apart : how many estimates did not fit in.
+    waived : what those that entered by intersection rest on.
+    """
 
     estimate: Estimate
     known: dict[Life, int]
     information: Information | None = None
     apart: int = 0
+    waived: Mapping[Life, int] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +150,7 @@ class Knowledge:
         self.setting, self.life, self.now, self.begun = setting, life, step, step
         self.nodes: dict[Name, Node] = {}
         self.worth: dict[Vector, Worth] = {}
+        self.waived: dict[Life, int] = {}
         self.own: Node
         self._claim: Claim | None = None
 
@@ -255,7 +266,10 @@ class Gossip(Knowledge):
 
     def _told(self, agent: int, since: int) -> Iterator[Any]:
         """What an agent said that it knew, in each life that was heard of lately and that no later one goes on from."""
-        lives = [(life, k) for life, k in self.own.known.items() if life.agent == agent and k >= since]
+        latest = dict(self.own.known)
+        for life, step in self.nodes:
+            latest[life] = max(step, latest.get(life, 0))
+        lives = [(life, k) for life, k in latest.items() if life.agent == agent and k >= since]
         heard = [(life, k, self.nodes[life, k].known) for life, k in lives if (life, k) in self.nodes]
         for life, k, known in heard:
             if not any(other != life and theirs.get(life, 0) >= k for other, _, theirs in heard):
@@ -265,6 +279,7 @@ class Gossip(Knowledge):
         """Put down the agent's own node of this step."""
         known = {**claim.known, self.life: self.now}
         self._claim = None
+        _join(self.waived, claim.waived)
         self.own = self.nodes[self.life, self.now] = Node(self.life, self.now, known, v, (M,))
         self._forget()
 
@@ -310,7 +325,7 @@ class Graph(Gossip):
         arrived, own = self.arrived(), self.own
         held = [own, *(node for node in self.nodes.values() if node.step <= self.now and node is not own)]
         search = self._search(held)
-        mask, known, apart = search.mask(own.name), dict(own.known), []
+        mask, known, apart, lacks = search.mask(own.name), dict(own.known), [], {}
         whole = mask
         for node in arrived:
             whole |= search.mask(node.name)
@@ -320,24 +335,31 @@ class Graph(Gossip):
             more = mask | search.mask(node.name)
             if more != mask and search.claimed(more) is None:
                 apart.append(node)
+                lacks[node.name] = search.lacks
                 continue
             mask = more
             _join(known, node.known)
         information = search.claimed(mask) or Information(own.v, own.M[0])
         apart = [n for n in apart if not any(n is not o and n.step <= o.known.get(n.life, 0) for o in apart)]
-        meet = [node for node in apart if self.setting.protocol.missing == "intersect" or self._silent(node.life.agent)]
+        meet = [node for node in apart if not self._comes(lacks[node.name])]
         if not meet:
             return Claim(from_information(information), known, information, len(apart))
         estimate = from_information(information)
+        waived: dict[Life, int] = {}
         for node in meet:
             estimate = self._intersected(estimate, node)
             _join(known, node.known)
-        return Claim(estimate, known, to_information(estimate), len(apart))
+            _join(waived, node.known)
+        return Claim(estimate, known, to_information(estimate), len(apart), waived)
 
-    def _silent(self, agent: int) -> bool:
-        """Whether nothing of an agent was fused for longer than the horizon."""
-        latest = max((k for life, k in self.own.known.items() if life.agent == agent), default=self.begun)
-        return latest < self.now - self.setting.protocol.horizon
+    def _comes(self, lacking: Name | None) -> bool:
+        """Whether to wait: not for what all have forgotten, or what was done without before and is taken for known."""
+        if lacking is None or self.setting.protocol.missing == "intersect":
+            return False
+        life, step = lacking
+        return (
+            life != self.life and step >= self.now - self.setting.protocol.horizon and step > self.waived.get(life, 0)
+        )
 
     def _intersected(self, estimate: Estimate, node: Node) -> Estimate:
         information = Information(node.v, node.M[0])
@@ -389,17 +411,21 @@ def _intersections(sets: Iterable[int]) -> set[int]:
 
 
 class UnknownError(Exception):
-    """A search met a node that is not held."""
+    """A search met a value that is not held."""
+
+    def __init__(self, value: int) -> None:
+        self.value = value
 
 
 class _Sums:
-    """Information pairs in the place of a ledger's values, for `Pedigrees`; −1: not held."""
+    """Information pairs in the place of a ledger's values, for `Pedigrees`; None: not held."""
 
     def __init__(self, forward: Callable[[Information, int], Information]) -> None:
         self.step: list[int] = []
-        self._forward, self._at = forward, {}
+        self._forward = forward
+        self._at: dict[tuple[int, int], Information | None] = {}
 
-    def add(self, step: int, information: Information) -> int:
+    def add(self, step: int, information: Information | None) -> int:
         """Put a pair down."""
         self._at[len(self.step), step] = information
         self.step.append(step)
@@ -407,10 +433,10 @@ class _Sums:
 
     def at(self, value: int, step: int) -> Information:
         """A value brought forward to a step."""
-        if value < 0:
-            raise UnknownError
         known = self._at.get((value, step))
         if known is None:
+            if step == self.step[value]:
+                raise UnknownError(value)
             known = self._at[value, step] = self._forward(self.at(value, step - 1), step)
         return known
 
@@ -447,9 +473,10 @@ class _Search:
             if name == origin and root is not None:
                 values.append(self.sums.add(1, root))
             else:
-                values.append(-1 if node is None else self.sums.add(node.step, Information(node.v, node.M[0])))
+                values.append(self.sums.add(name[1], None if node is None else Information(node.v, node.M[0])))
         self.pedigrees = Pedigrees(self.sums, values, below)  # pyright: ignore[reportArgumentType]
         self.pedigrees.most = MOST_TERMS
+        self.lacks: Name | None = None
         for vector, (step, information) in worth.items():
             self.pedigrees.know(self.whole(dict(vector)), self.sums.add(step, information))
 
@@ -481,12 +508,19 @@ class _Search:
         return max(self.order[mask.bit_length() - 1][1], 1)
 
     def claimed(self, mask: int) -> Information | None:
-        """Information of a pedigree; None where that cannot be told from what is held, or is no covariance's."""
+        """Information of a pedigree; None where that cannot be told from what is held, or is no covariance's.
+
+        `lacks` is then the name of what is missing, if anything is.
+        """
+        self.lacks = None
         try:
             value = self.pedigrees.fuse(mask)
             information = self.sums.at(value, self.sums.step[value])
             np.linalg.cholesky(information.Y)
-        except (UnknownError, TooManyError, np.linalg.LinAlgError):
+        except UnknownError as error:
+            self.lacks = self.order[error.value]  # the first values are the nodes'
+            return None
+        except (TooManyError, np.linalg.LinAlgError):
             return None
         return information if np.isfinite(information.y).all() else None
 

@@ -112,8 +112,8 @@ class MessageProtocol:
     window : steps, this one included.
     horizon : steps after which an agent that was not heard of is no longer waited for, and nodes are forgotten.
     missing : what is done with a node whose common information with what is known rests on nodes that are not there:
-        "wait": it is left until they come, unless nothing of its agent was fused for longer than the horizon; else, and
-        with "intersect" at once: it is fused by covariance intersection, as if nothing were known of it.
+        "wait": it is left until they come, unless nobody will send them any more; then, and with "intersect" at once,
+        it is fused by covariance intersection, as if nothing were known of what it shares.
     """
 
     carries: str = "acknowledged"

@@ -57,6 +57,26 @@ def test_a_standard_error_is_that_of_the_mean_where_that_is_what_is_shown():
     np.testing.assert_allclose(found.load(0).error[0], groups.std(ddof=1) / np.sqrt(20), rtol=1e-10)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("missing", ["wait", "intersect"])
+def test_after_a_silence_longer_than_the_horizon_all_is_as_if_there_had_been_none(missing):
+    """Cautious while nobody holds what both share, exact again some steps later; with a longer horizon exact throughout."""
+    steps, n = 46, 3
+    link = np.full((steps, n, n), 0.6) * (1 - np.eye(n))
+    link[9:32, 2] = link[9:32, :, 2] = 0  # the third is silent, and deaf, in steps 10 to 32
+    model = {"F": [[1]], "H": [[1]], "Q": [[25]], "R": [[100]]}
+    network = {"agents": n, "steps": steps, "link": link.tolist()}
+    s = sf.load_scenario({"model": model, "initial": {"P": [[100]]}, "network": network})
+    policies = [sf.MessageProtocol(horizon=horizon) for horizon in (8, 40)]
+    short, long = sf.protocol_load(s, None, policies, runs=5, missing=missing).lived
+    assert not long.apart.any()
+    np.testing.assert_allclose(short.P[:, :, :32], long.P[:, :, :32], rtol=1e-8)
+    assert short.apart[:, :, 32:36].any()
+    assert short.actual[:, :, 32:36].mean() < 1.05 * short.P[:, :, 32:36].mean()
+    assert not short.apart[:, :, -3:].any()
+    np.testing.assert_allclose(short.P[:, :, -1].mean(), long.P[:, :, -1].mean(), rtol=0.01)
+
+
 def test_on_the_command_line():
     asked = ("--steps", "3", "--runs", "10", "--link", "0,1")
     found = strict_json(
