@@ -113,14 +113,14 @@ def test_in_every_history_it_is_replay(name, data):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LIVE)
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(st.data())
 def test_in_every_longer_history_it_is_replay(name, data):
     check_history(name, data.draw(histories(name, 3, 9)))
 
 
 @pytest.mark.slow
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(histories("local-fusion-graph", 4, 6))
 def test_messages_that_carry_everything_say_no_more(history):
     check_history("local-fusion-graph", history, "full")
@@ -128,7 +128,7 @@ def test_messages_that_carry_everything_say_no_more(history):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("link", [0.3, 0.6, 1.0])
+@pytest.mark.parametrize("link", [0.4, 1.0])
 @pytest.mark.parametrize("name", ["local-fusion-graph", "optimal"])
 def test_beyond_the_horizon_it_is_replay_too_and_holds_little(name, link):
     """80 steps, far more than the horizon of 32: nothing that was forgotten is missed."""
@@ -145,7 +145,7 @@ def test_beyond_the_horizon_it_is_replay_too_and_holds_little(name, link):
 
 
 def test_sensors_that_are_not_linear_are_linearised_as_in_a_run():
-    s = sf.load_scenario("two-radars")
+    s = sf.load_scenario("two-radars").until(7)
     n, steps = s.network.agents, s.network.steps
     made = drawn(s.system, s.instruments, s.nominal[0].reshape(-1, 1), 1, 3)
     came = [(k, i, j, 0) for k in range(1, steps + 1) for i in range(n) for j in range(n) if i != j and (k + i) % 3]
