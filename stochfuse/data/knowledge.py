@@ -52,8 +52,8 @@ from stochfuse.kalman.kernel import (
 )
 from stochfuse.scenario.registry import LFG, OPTIMAL, STAND_ALONE
 
-MOST_TERMS = 20_000
-"""Intersections of one search of the graph; beyond, what is heard enters by covariance intersection."""
+MOST_TERMS = 60_000
+"""Intersections that a step's searches go through; beyond, what is heard enters by covariance intersection."""
 MOST_SETS = 4_000
 """Intersections of pedigrees that are worked out beforehand; where they are more, the horizon alone forgets."""
 

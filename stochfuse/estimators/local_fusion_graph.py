@@ -68,7 +68,7 @@ class Pedigrees:
 
     Attributes
     ----------
-    most : intersections of one search, beyond which TooManyError is raised.
+    most : intersections that searches may go through from here on; then TooManyError is raised.
     """
 
     def __init__(
@@ -91,12 +91,13 @@ class Pedigrees:
         terms: dict[int, int] = {}
         for top in self.maximal(mask):
             if len(terms) > self.most:
-                raise TooManyError(f"common information: more than {self.most} intersections of pedigrees")
+                raise TooManyError("common information: more intersections of pedigrees than are gone through")
             below = self.below[top]
             found = [(below, 1)]
             found += [(other & below, -times) for other, times in terms.items() if other & below]
             for shared, times in found:
                 terms[shared] = terms.get(shared, 0) + times
+        self.most -= len(terms)
         return terms
 
     def fuse(self, mask: int) -> int:
