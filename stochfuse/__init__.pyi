@@ -5,6 +5,14 @@ from typing import Any
 from stochfuse import fusion as fusion
 from stochfuse import kalman as kalman
 from stochfuse import thesis as thesis
+from stochfuse.data.agent import Agent as Agent
+from stochfuse.data.agent import Start as Start
+from stochfuse.data.messages import MessageProtocol as MessageProtocol
+from stochfuse.data.protocols import ProtocolLoad as ProtocolLoad
+from stochfuse.data.protocols import protocol_load as protocol_load
+from stochfuse.data.robot_run import RobotRun as RobotRun
+from stochfuse.data.robot_run import run_robots as run_robots
+from stochfuse.errors import MessageError as MessageError
 from stochfuse.data.crosscheck import Verdict as Verdict
 from stochfuse.data.crosscheck import check_results as check_results
 from stochfuse.data.crosscheck import crosscheck as crosscheck

@@ -54,6 +54,10 @@ class TooManyError(UsageError):
     """More outcomes than can be listed."""
 
 
+class MessageError(StochfuseError, ValueError):
+    """A message, or a saved agent, that cannot be what it should be; nothing of it was taken in."""
+
+
 class NoAnswerError(StochfuseError):
     """The question has no answer: the filter diverges, the target cannot be reached.
 

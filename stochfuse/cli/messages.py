@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from stochfuse.questions.messages import Load
 
 BOTH, EXACT = "both", "exact"
+MISSING = ("wait", "intersect")
 EXAMPLES = (
     "stochfuse messages --steps 12 --from-step 6 --architecture broadcast",
     "stochfuse messages --accuracy --steps 3 --bytes",
@@ -42,7 +43,7 @@ class Listed(NamedTuple):
     distribution: Annotated[
         bool, option("Probabilities of every number of nodes instead.", SHOWN, "--distribution")
     ] = False
-    cdf: Annotated[bool, option("Probabilities of at most so many nodes instead.", SHOWN, "--cdf")] = False
+    cdf: Annotated[bool, option("Probabilities of at most so many nodes instead.", SHOWN + RARE, "--cdf")] = False
     accuracy: Annotated[
         bool, option("Accuracy of the fused estimate beside the load instead.", SHOWN, "--accuracy")
     ] = False
@@ -56,6 +57,22 @@ class Listed(NamedTuple):
         int | None,
         option("Bytes of every message beside its nodes; sets --bytes.", SHOWN + RARE, min=0, metavar="BYTES"),
     ] = None
+    protocol: Annotated[
+        str | None,
+        option(
+            "Live agents instead: acknowledged, full, own, window:W, or several.",
+            SHOWN,
+            metavar="NAME",
+        ),
+    ] = None
+    missing: Annotated[
+        str | None,
+        choice(
+            MISSING,
+            "--protocol: what rests on estimates that are not there waits, or is intersected; default: wait.",
+            SHOWN + RARE,
+        ),
+    ] = None
 
 
 def messages(
@@ -68,7 +85,7 @@ def messages(
     from_step: Annotated[
         int | None, option("First step counted; default: 1; the last: --steps.", SHOWN, min=1, metavar="K")
     ] = None,
-    step: Annotated[int | None, option("Count this step alone.", SHOWN, min=1, metavar="K")] = None,
+    step: Annotated[int | None, option("Count this step alone.", SHOWN + RARE, min=1, metavar="K")] = None,
     agent: Annotated[
         str, option("Whose load, where agents differ: mean or an agent's number; default: mean.", SHOWN, metavar="N")
     ] = "mean",
@@ -91,6 +108,19 @@ def messages(
     from stochfuse.report import messages as reports
 
     to.check(scenario)
+    if shown.protocol is not None:
+        other = {
+            "--over": over,
+            "--rule": rule == NAIVE,
+            "--method": method != EXACT,
+            "--distribution": shown.distribution,
+            "--cdf": shown.cdf,
+            "--header": shown.header is not None,
+        }
+        _by_protocol(scenario, changes, other, (from_step, step), agent, shown, sampling, to)
+        return
+    if shown.missing is not None:
+        raise UsageError("--missing: expected --protocol, which it is for")
     kind = _kind(distribution=shown.distribution, cdf=shown.cdf, accuracy=shown.accuracy)
     if kind in ("distribution", "cdf") and (shown.bytes or shown.header is not None):
         raise UsageError(f"--{kind}: expected neither --bytes nor --header, every node has the same size")
@@ -125,6 +155,37 @@ def messages(
     view = reports.LoadView(loads, of_rule[NAIVE], kind, whose, in_bytes, accuracies, chosen, to.digits)
     _note(loads, accuracies)
     to.write(reports.load_report(view))
+
+
+def _by_protocol(
+    scenario: str,
+    changes: Changes,
+    other: dict[str, Any],
+    window: tuple[int | None, int | None],
+    agent: str,
+    shown: Shown,
+    sampling: Sampling,
+    to: Written,
+) -> None:
+    """What live agents send, and what it is worth to them."""
+    from stochfuse.data.protocols import protocol_load
+    from stochfuse.kalman.metrics import metric as metric_of
+    from stochfuse.report.protocols import ProtocolView, protocol_report
+
+    for flag, given in other.items():
+        if given:
+            raise UsageError(f"{flag}: expected without --protocol, which samples what live agents send in bytes")
+    given, links = changes.of(scenario)
+    names = [name.strip() for name in (shown.protocol or "").split(",")]
+    drawn = {name: value for name, value in sampling._asdict().items() if value is not None}
+    first, last = _window(given.network.steps, *window)
+    rule = given.estimator or LFG
+    found = protocol_load(given, links, names, estimator=rule, missing=shown.missing or MISSING[0], **drawn)
+    chosen = metric_of(shown.metric or given.metric or "trace", given.model) if shown.accuracy else None
+    view = ProtocolView(
+        found.between(first, last), whole(agent) or agent, chosen, shown.quantity or "actual", to.digits
+    )
+    to.write(protocol_report(view))
 
 
 def _kind(**wanted: bool) -> str:

@@ -24,9 +24,11 @@ of the true state whatever it is, so that states found equal are; the property t
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from stochfuse.errors import TooManyError
 from stochfuse.estimators.ledger import COMMON, Ledger
 from stochfuse.estimators.protocol import FusionRule, Late, best_relabelling
 
@@ -63,6 +65,10 @@ class Pedigrees:
     below : pedigree of each node, itself included, as a mask; every ancestor has a smaller number, and steps never
         fall.
     older : pedigrees that have the first nodes in common with these, so that what is known of them holds here.
+
+    Attributes
+    ----------
+    most : intersections that searches may go through from here on; then TooManyError is raised.
     """
 
     def __init__(
@@ -71,6 +77,7 @@ class Pedigrees:
         self.ledger, self.values, self.below, self._older = ledger, values, below, older
         self._new = 1 << len(older.values) if older else 0
         self._known: dict[int, int] = {}
+        self.most = sys.maxsize
 
     def maximal(self, mask: int) -> Iterator[int]:
         """Nodes of a mask without a descendant in it, latest first."""
@@ -83,11 +90,14 @@ class Pedigrees:
         """Inclusion–exclusion (1) over the maximal nodes: the coefficient of every intersection."""
         terms: dict[int, int] = {}
         for top in self.maximal(mask):
+            if len(terms) > self.most:
+                raise TooManyError("common information: more intersections of pedigrees than are gone through")
             below = self.below[top]
             found = [(below, 1)]
             found += [(other & below, -times) for other, times in terms.items() if other & below]
             for shared, times in found:
                 terms[shared] = terms.get(shared, 0) + times
+        self.most -= len(terms)
         return terms
 
     def fuse(self, mask: int) -> int:
@@ -104,6 +114,37 @@ class Pedigrees:
                 known = self.ledger.combine(self.ledger.step[self.values[top]], terms)
             self._known[mask] = known
         return known
+
+    def know(self, mask: int, value: int) -> None:
+        """Remember what a pedigree is worth, so that no search goes below it."""
+        self._known[mask] = value
+
+    def reachable(self, known: Sequence[int], kept: int = 0) -> int:
+        """Nodes that a later search can meet: given ones, and the maximal ones of any two pedigrees' intersection.
+
+        Parameters
+        ----------
+        known : pedigrees that a search can begin with.
+        kept : nodes that it can meet whatever else it does.
+        """
+        below, done = self.below, set()
+        members = [*known, *(below[n] for n in range(kept.bit_length()) if kept >> n & 1)]
+        i = 1
+        while i < len(members):
+            mask = members[i]
+            for other in members[:i]:
+                shared = mask & other
+                if shared in done:
+                    continue
+                done.add(shared)
+                while shared:
+                    top = shared.bit_length() - 1
+                    if not kept >> top & 1:
+                        kept |= 1 << top
+                        members.append(below[top])
+                    shared &= ~below[top]
+            i += 1
+        return kept
 
 
 class LocalFusionGraph(FusionRule):
@@ -222,7 +263,11 @@ class GraphExchange:
     def _merged(
         self, agents: Sequence[Agent], waiting: dict[tuple[int, int], int]
     ) -> tuple[GraphState, tuple[int, ...]]:
-        kept = self._reachable([agent.known for agent in agents], list(waiting.values()))
+        kept = 0
+        for mask in waiting.values():  # a message's own node is met when it arrives
+            for node in self.pedigrees.maximal(mask):
+                kept |= 1 << node
+        kept = self.pedigrees.reachable([*(agent.known for agent in agents), *waiting.values()], kept)
         nodes = [node for node in range(kept.bit_length()) if kept >> node & 1]
         ledger, n = self.estimator.ledger, len(agents)
         values, below, step, moved = self.pedigrees.values, self.pedigrees.below, ledger.step, ledger.moved
@@ -267,31 +312,6 @@ class GraphExchange:
         if best is None:
             raise ValueError("no relabelling given")
         return best
-
-    def _reachable(self, known: Sequence[int], messages: Sequence[int]) -> int:
-        """Nodes that a later search can meet."""
-        below = self.pedigrees.below
-        kept, done = 0, set()
-        for mask in messages:  # a message's own node is met when it arrives
-            for node in self.pedigrees.maximal(mask):
-                kept |= 1 << node
-        members = [*known, *messages, *(below[n] for n in range(kept.bit_length()) if kept >> n & 1)]
-        i = 1
-        while i < len(members):
-            mask = members[i]
-            for other in members[:i]:
-                shared = mask & other
-                if shared in done:
-                    continue
-                done.add(shared)
-                while shared:
-                    top = shared.bit_length() - 1
-                    if not kept >> top & 1:
-                        kept |= 1 << top
-                        members.append(below[top])
-                    shared &= ~below[top]
-            i += 1
-        return kept
 
 
 def _sequence(keys: Sequence[Any], nodes: Sequence[int], below: Sequence[int]) -> list[int]:

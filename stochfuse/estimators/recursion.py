@@ -77,6 +77,8 @@ class RecursiveEstimator:
     additive, joint = False, False
     gathers: str | None = None
     """Name of the rule by which agents that track one state fuse all that they hear; None if they fuse nothing."""
+    split = False
+    """Whether fusion asks what of an estimate only its own step's measurement brought."""
     symmetric: tuple[str, ...] = ()
     headed: tuple[str, ...] = ()
     mixed: tuple[str, ...] = ()

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from stochfuse.data.crosscheck import Verdict
+from stochfuse.data.protocols import ProtocolLoad
 from stochfuse.data.run import RunResult
 from stochfuse.errors import UsageError, needed
 from stochfuse.estimators.fusion_graph import FusionGraph
@@ -29,6 +30,7 @@ from stochfuse.report import (
     links,
     messages,
     predictions,
+    protocols,
     solutions,
     study_figures,
 )
@@ -64,6 +66,8 @@ def report_of(result: Any, of: str | None = None, agent: int | str = "mean") -> 
         return solutions.solution_report(sheet(result), result)
     if isinstance(result, Critical):
         return critical_report(result)
+    if isinstance(result, ProtocolLoad):
+        return protocols.protocol_report(protocols.ProtocolView(result))
     if isinstance(result, MessageLoad | SweptLoad):
         return messages.load_report(messages.LoadView((result,), result))
     if isinstance(result, Results):

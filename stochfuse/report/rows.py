@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from stochfuse.data.protocols import ProtocolLoad
 from stochfuse.prediction.result import Prediction
 from stochfuse.prediction.swept import Swept
 from stochfuse.questions.messages import Load, SweptLoad
@@ -30,7 +31,7 @@ class ResultRows:
     result : the result.
     """
 
-    result: Prediction | Swept | Load
+    result: Prediction | Swept | Load | ProtocolLoad
 
     @cached_property
     def over(self) -> Over | None:

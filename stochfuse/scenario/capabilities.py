@@ -351,6 +351,20 @@ def not_on_data(estimator: str, has: Sequence[str]) -> str | None:
     return None
 
 
+def not_live(estimator: str, system: System) -> str | None:
+    """Why an estimator is no live agent's in such a system; None if it is."""
+    needs = registry.estimator(estimator).not_live
+    if not needs and system.own:
+        needs = "what agents with states of their own (model.own) measured of each other"
+    if not needs:
+        return None
+    takes = ", ".join(e.name for e in registry.ESTIMATOR if not e.not_live)
+    return (
+        f"estimator {estimator}: a live agent fuses estimates that it hears; expected one of {takes}, of one state; "
+        f"got one that needs {needs}"
+    )
+
+
 def matrix(own: Sequence[OwnRule] = ()) -> dict[str, dict[str, dict[str, bool | str]]]:
     """Return the whole table: estimator, engine, feature → True or the reason.
 

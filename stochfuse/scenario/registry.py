@@ -32,6 +32,7 @@ class EstimatorEntry(NamedTuple):
     weighs : whether its weights minimise a criterion.
     own_states, own_filters : whether agents may have states, or filters of a common state, of their own.
     footprints : whether it carries its error along as coefficients on all noises.
+    not_live : what its fusion needs beside estimates that were heard, so that it is no live agent's; else empty.
     cites : keys of its sources beside the thesis, see `stochfuse.report.citations`.
     """
 
@@ -46,6 +47,7 @@ class EstimatorEntry(NamedTuple):
     own_filters: bool = False
     footprints: bool = True
     cites: tuple[str, ...] = ()
+    not_live: str = ""
 
 
 class EngineEntry(NamedTuple):
@@ -169,6 +171,7 @@ ESTIMATOR = (
         ("equivalent", "EquivalentMeasurement"),
         cites=("uncertain-fusion",),
         footprints=False,
+        not_live="measurements of one platform, which are exchanged in the place of estimates",
     ),
     EstimatorEntry(
         "independent-measurements",
@@ -178,6 +181,7 @@ ESTIMATOR = (
         ("equivalent", "IndependentMeasurements"),
         cites=("uncertain-fusion",),
         footprints=False,
+        not_live="measurements of one platform, which are exchanged in the place of estimates",
     ),
     EstimatorEntry(
         "lwin",
@@ -197,6 +201,7 @@ ESTIMATOR = (
         cites=("li2021",),
         own_states=True,
         footprints=False,
+        not_live="a centre that keeps one covariance for all agents",
     ),
     EstimatorEntry(
         STAND_ALONE,

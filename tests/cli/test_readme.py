@@ -77,10 +77,17 @@ def test_console_examples(command, output, folder):
     assert execute(command, folder) == output
 
 
-@pytest.mark.parametrize("code", re.findall(r"```python\n(.*?)```", everything(), re.DOTALL))
-def test_python_example(code, tmp_path):
+PYTHON = re.compile(r"```python\n(.*?)```(?:\n\n```text\n(.*?)```)?", re.DOTALL)
+
+
+@pytest.mark.parametrize(("code", "output"), PYTHON.findall(everything()))
+def test_python_example(code, output, tmp_path):
     (tmp_path / "example.py").write_text(code)
-    assert "thesis-transient: 3 agents, ad-hoc; every agent alike" in execute(f"{sys.executable} example.py", tmp_path)
+    printed = execute(f"{sys.executable} example.py", tmp_path)
+    if output:
+        assert printed == output.strip("\n")
+    else:
+        assert "thesis-transient: 3 agents, ad-hoc; every agent alike" in printed
 
 
 def test_scenario_example_is_valid(tmp_path):
