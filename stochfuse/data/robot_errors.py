@@ -14,13 +14,15 @@ Odometry has no subjects.  A robot that turns also loses speed, in proportion to
 How it is found, all of it by second moments:
 
     constants   means of the robots, shrunk to their common mean as far as they differ no more than chance lets them
-    processes   least squares of pairs' products e e′/(u u′) over the lag: pairs of different subjects show the common
-                process, pairs of one subject both, what is left at lag 0 is white; robots pooled
-    variances   of each robot, shrunk to the pooled one in the same way (empirical Bayes in the logarithm)
+                (random effects, DerSimonian and Laird 1986)
+    processes   least squares of pairs' products e e′ over the lag: pairs of different subjects show the common
+                process, pairs of one subject both, what is left at lag 0 is white
+    variances   of all robots together: they are of one make, and how much a robot's errors vary in one minute says
+                little of how much they do in the next
 
-As how many independent numbers a robot's N errors count, for its mean N/D and for its variance, follows from the
-processes: D = Σ ρ(t, t′)/N is the factor by which errors that stay alike count for more than white ones.  Errors of
-more than `GROSS` pooled deviations (a barcode misread) are left out and counted.
+A robot's N errors count for its mean as N/D independent ones, D = Σ ρ(t, t′)/N: the factor by which errors that stay
+alike count for more than white ones.  Errors of more than `GROSS` pooled deviations (a barcode misread) are left out
+and counted.
 
 White Gaussian noise is the special case without constants and processes (`Noises.white`); what it cannot express is
 D, the factor that its claims leave out.
@@ -188,17 +190,15 @@ def _channel(name: str, errors: _Errors, n: int) -> Channel:
     number = np.bincount(errors.robot, minlength=n)
     weight = np.bincount(errors.robot, errors.size**2, n)
     mean = _ratio(np.bincount(errors.robot, errors.error * errors.size, n), weight)
-    pooled = errors.error - mean[errors.robot] * errors.size
-    shares, pairs, times = _processes(errors, pooled)
-    total = _ratio(np.bincount(errors.robot, pooled**2, n), weight)
-    D, D_variance = (_design(errors, pairs, shares, times, n, power) for power in (1, 2))
+    residual = errors.error - mean[errors.robot] * errors.size
+    shares, pairs, times = _processes(errors, residual)
+    D = _design(errors, pairs, shares, times, n)
     independent = np.maximum(_ratio(_effective(errors, n), D), 1.0)
-    total *= independent / np.maximum(independent - 1.0, 1.0)
-    seen_any = weight > 0
-    freedom = np.maximum(_ratio(_effective(errors, n), D_variance), 1.0)
-    variance = np.exp(_shrunk(np.log(np.maximum(total, 1e-12)), 2.0 / freedom, seen_any)[0])
-    mean, doubt = _shrunk(mean, variance / independent, seen_any)
-    common, subject, white = (variance * share for share in shares)
+    # means of robots were taken out of what is pooled
+    lost = float((weight / independent).sum() / weight.sum())
+    variance = float((residual**2).sum() / (errors.size**2).sum()) / max(1.0 - lost, 0.5)
+    mean, doubt = _shrunk(mean, variance / independent, weight > 0)
+    common, subject, white = (np.full(n, variance * share) for share in shares)
     return Channel(mean, doubt, Process(common, times[0]), Process(subject, times[1]), white, D, number)
 
 
@@ -240,10 +240,7 @@ def _processes(
     pairs, u = _pairs(errors), errors.size
     several = not pairs.same.all()
     variance = float((residual**2).sum() / (u**2).sum())
-    # robots of unlike variance say the same of the shares
-    scale = np.sqrt(np.bincount(errors.robot, residual**2) / np.maximum(np.bincount(errors.robot, u**2), 1e-300))
-    scale = np.where(scale > 0, scale, np.sqrt(variance))[errors.robot]
-    e = residual / scale
+    e = residual / np.sqrt(variance)
     products = e[pairs.first] * e[pairs.second]
     sizes = u[pairs.first] * u[pairs.second]
     bins = (pairs.lag / BIN).astype(int)
@@ -264,13 +261,14 @@ def _processes(
 
 def _memory(bins: np.ndarray, products: np.ndarray, sizes: np.ndarray) -> tuple[float, float]:
     """Variance and correlation time of the process that fits products of pairs best over the lag."""
-    if not len(bins):
+    if not (len(bins) and sizes.any()):
         return 0.0, 1.0
     weight = np.bincount(bins, sizes**2)
     mean = _ratio(np.bincount(bins, products * sizes), weight)
     lag = (np.arange(len(weight)) + 0.5) * BIN
     best = (np.inf, 0.0, 1.0)
-    for time in np.geomspace(BIN, LONGEST, 60):
+    # shorter than the shortest lag it cannot be told from white
+    for time in np.geomspace(lag[np.flatnonzero(weight)[0]], LONGEST, 60):
         shape = np.exp(-lag / time)
         variance = max(0.0, float((weight * mean * shape).sum() / max((weight * shape**2).sum(), 1e-300)))
         left = float((weight * (mean - variance * shape) ** 2).sum())
@@ -280,19 +278,19 @@ def _memory(bins: np.ndarray, products: np.ndarray, sizes: np.ndarray) -> tuple[
 
 
 def _design(
-    errors: _Errors, pairs: _Pairs, shares: tuple[float, float, float], times: tuple[float, float], n: int, power: int
+    errors: _Errors, pairs: _Pairs, shares: tuple[float, float, float], times: tuple[float, float], n: int
 ) -> np.ndarray:
-    """Σ ρ(t, t′)^power over a robot's pairs, both ways and with themselves, in units of its number; (robots,)."""
+    """D of each robot, (robots,)."""
     rho = shares[0] * np.exp(-pairs.lag / times[0]) + pairs.same * shares[1] * np.exp(-pairs.lag / times[1])
     u = errors.size
     # of a weighted mean, weights u²
-    across = np.bincount(errors.robot[pairs.first], (rho**power) * (u[pairs.first] * u[pairs.second]) ** 2, n)
+    across = np.bincount(errors.robot[pairs.first], rho * (u[pairs.first] * u[pairs.second]) ** 2, n)
     alone = np.bincount(errors.robot, u**4, n)
     return np.where(alone > 0, 1.0 + 2.0 * _ratio(across, alone), 1.0)
 
 
 def _shrunk(values: np.ndarray, variance: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values of the robots drawn to their common mean, and the variance that is left (DerSimonian and Laird 1986)."""
+    """Values of the robots drawn to their common mean, and the variance that is left."""
     v, s = values[known], np.maximum(variance[known], 1e-300)
     w = 1.0 / s
     middle = float((w * v).sum() / w.sum())

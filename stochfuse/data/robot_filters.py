@@ -37,14 +37,15 @@ import numpy as np
 
 from stochfuse.data.robot_errors import BLOCK, Channel, Noises
 from stochfuse.data.robots import RobotRecord, moved, seen, wrapped
-from stochfuse.fusion.cooperative import itns_update, lwin_update
-from stochfuse.fusion.intersection import fuse_stack
+from stochfuse.fusion.cooperative import lwin_update
 from stochfuse.kalman.algebra import NUMPY
-from stochfuse.kalman.kernel import Estimate, predict, update
+from stochfuse.kalman.kernel import Estimate, corrected, predict, update
 
 ESTIMATORS = ("stand-alone", "naive", "covariance-intersection", "split-ci", "lwin", "itns")
 GATE = 40.0
 """Squared normalised innovation (two degrees of freedom: 2e-9 by chance) that is no sighting of this subject."""
+GRID = (np.arange(24) + 0.5) / 24.0
+"""Weights tried, of the interval at hand."""
 START = 0.05
 """Deviation of the first estimates from the truth that the filters assume [m, rad]; they begin at the truth."""
 
@@ -197,26 +198,52 @@ class Claims:
         if self.estimator in ("naive", "lwin"):
             found = lwin_update(_unit(mine, 3), _unit(other, 3), H_k, H_o, R, np.eye(2))
             return found.x, found.P, None
-        H_k = np.broadcast_to(H_k, (len(mine), 2, 3))
-        noise = np.broadcast_to(R, (len(mine), 2, 2))
         theirs = H_o @ other @ NUMPY.transpose(H_o)
         if own is None:
-            first, second = (mine, theirs + noise), (np.zeros_like(mine), np.zeros_like(theirs))
-        else:
-            known = H_o @ own[:, 1 - k] @ NUMPY.transpose(H_o)
-            first, second = (mine - own[:, k], theirs - known), (own[:, k], known + noise)
-        stack = fuse_stack(first, second, [None, H_k])
-        kept = None
-        if own is not None:
-            parts = zip(stack.gains, second, strict=True)
-            kept = NUMPY.symmetric(sum(G @ A @ NUMPY.transpose(G) for G, A in parts))
-        return stack.gains[1], stack.C, kept
+            return *_intersected(mine, np.zeros_like(mine), theirs + R, np.zeros_like(theirs), H_k), None
+        known = H_o @ own[:, 1 - k] @ NUMPY.transpose(H_o)
+        K, P = _intersected(mine - own[:, k], own[:, k], theirs - known, known + R, H_k)
+        return K, P, corrected(own[:, k], K, H_k, known + R)
 
     def _joint(self, H: np.ndarray, R: np.ndarray, valid: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         fine = valid(H @ self.P @ NUMPY.transpose(H) + R)
-        found = itns_update(_unit(self.P, 3 * self.n), H, R, np.eye(2))
+        found = update(_unit(self.P, 3 * self.n), H, R, np.eye(2))
         self.P = np.where(fine, found.P, self.P)
         return np.where(fine, found.x, 0.0)
+
+
+def _intersected(
+    A1: np.ndarray, A2: np.ndarray, B1: np.ndarray, B2: np.ndarray, H: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gain and covariance of split covariance intersection of the whole state with one measurement, least det C.
+
+    C⁻¹ = (A1/ω + A2)⁻¹ + Hᵀ(B1/(1 − ω) + B2)⁻¹H is a Kalman update with inflated covariances, and
+    det C = |A(ω)| |B(ω)| / |B(ω) + H A(ω) Hᵀ|; the weight by a grid, twice refined around the best.  The same as
+    `stochfuse.fusion.intersection.fuse_stack`, for two signals and a thousand times in a row.
+    """
+    G1, G2 = (H @ A @ NUMPY.transpose(H) for A in (A1, A2))
+    alpha = np.linalg.eigvals(np.linalg.solve(A1 + A2, A1)).real.clip(0.0, 1.0)
+
+    def log_det(w: np.ndarray) -> np.ndarray:
+        a, b = 1.0 / w, 1.0 / (1.0 - w)
+        size = np.log(alpha[:, :, None] * a[:, None] + 1.0 - alpha[:, :, None]).sum(axis=1)
+        B, S = [[None] * 2 for _ in range(2)], [[None] * 2 for _ in range(2)]
+        for p in range(2):
+            for q in range(2):
+                B[p][q] = B1[:, p, q, None] * b + B2[:, p, q, None]
+                S[p][q] = B[p][q] + G1[:, p, q, None] * a + G2[:, p, q, None]
+        return size + np.log((B[0][0] * B[1][1] - B[0][1] ** 2) / (S[0][0] * S[1][1] - S[0][1] ** 2))
+
+    low, high = np.zeros(len(A1)), np.ones(len(A1))
+    for _ in range(3):
+        w = low[:, None] + (high - low)[:, None] * GRID
+        best = np.argmin(log_det(w), axis=1)
+        middle, reach = w[np.arange(len(w)), best], (high - low) * (GRID[1] - GRID[0])
+        low, high = np.maximum(middle - reach, 0.0), np.minimum(middle + reach, 1.0)
+    w = middle[:, None, None]
+    A, B = A1 / w + A2, B1 / (1.0 - w) + B2
+    found = update(_unit(A, 3), H, B, np.eye(2))
+    return found.x, found.P
 
 
 def _unit(P: np.ndarray, d: int) -> Estimate:
@@ -335,11 +362,9 @@ class Expected:
 
     def correct(self, event: Event, rows: list[int], K: np.ndarray, H: dict[int, np.ndarray], y: np.ndarray) -> None:
         i, first = event.robot, self.width * event.robot
-        far = y[..., 0].mean()
         size = np.array([event.measured[0], 1.0])
         columns = first + np.array([[4, 5, 8 + event.subject], [6, 7, 8 + self.subjects + event.subject]])
         white = size**2 * np.array([self.noises.range.white[i], self.noises.bearing.white[i]])
-        del far
         HE, HM = 0.0, 0.0
         for robot, h in H.items():
             block = slice(3 * robot, 3 * robot + 3)
