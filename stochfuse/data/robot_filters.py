@@ -131,10 +131,7 @@ class Claims:
 
     def blocks(self) -> np.ndarray:
         """Each robot's covariance, (items, robots, 3, 3)."""
-        if not self.joint:
-            return self.P
-        split = self.P.reshape(len(self.P), self.n, 3, self.n, 3)
-        return np.moveaxis(np.diagonal(split, axis1=1, axis2=3), -1, 1)
+        return _blocks(self.P, self.n) if self.joint else self.P
 
     def move(self, F: np.ndarray, Q: np.ndarray) -> None:
         """Predict with (items or 1, robots, 3, 3)."""
@@ -257,6 +254,11 @@ def _spread(H: np.ndarray, i: int, n: int) -> np.ndarray:
     return whole
 
 
+def _blocks(P: np.ndarray, n: int) -> np.ndarray:
+    """Diagonal blocks (items, n, 3, 3) of (items, 3n, 3n)."""
+    return np.moveaxis(np.diagonal(P.reshape(len(P), n, 3, n, 3), axis1=1, axis2=3), -1, 1)
+
+
 def _diagonal(blocks: np.ndarray) -> np.ndarray:
     """Block-diagonal (..., 3n, 3n) of (..., n, 3, 3)."""
     n = blocks.shape[-3]
@@ -331,6 +333,10 @@ class Expected:
         self.width = len(columns)
         self.E = np.zeros((items, 3 * self.n, 3 * self.n))
         self.M = np.zeros((items, 3 * self.n, len(self.variance)))
+
+    def blocks(self) -> np.ndarray:
+        """Each robot's error covariance, (items, robots, 3, 3)."""
+        return _blocks(self.E, self.n)
 
     def states(self, step: int) -> np.ndarray:
         return self.path[None, step]
