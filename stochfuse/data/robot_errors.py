@@ -233,9 +233,7 @@ def _pairs(errors: _Errors) -> _Pairs:
     return _Pairs(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
-def _processes(
-    errors: _Errors, residual: np.ndarray
-) -> tuple[tuple[float, float, float], _Pairs, tuple[float, float]]:
+def _processes(errors: _Errors, residual: np.ndarray) -> tuple[tuple[float, float, float], _Pairs, tuple[float, float]]:
     """Shares of the variance (common, subject, white), pairs of errors, and correlation times, robots pooled."""
     pairs, u = _pairs(errors), errors.size
     several = not pairs.same.all()

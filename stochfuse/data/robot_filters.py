@@ -35,7 +35,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from stochfuse.data.robot_errors import BLOCK, Channel, Noises
+from stochfuse.data.robot_errors import BLOCK, Noises
 from stochfuse.data.robots import RobotRecord, moved, seen, wrapped
 from stochfuse.fusion.cooperative import lwin_update
 from stochfuse.kalman.algebra import NUMPY
@@ -222,16 +222,13 @@ def _intersected(
     alpha = np.linalg.eigvals(np.linalg.solve(A1 + A2, A1)).real.clip(0.0, 1.0)
 
     def log_det(w: np.ndarray) -> np.ndarray:
-        a, b = 1.0 / w, 1.0 / (1.0 - w)
-        size = np.log(alpha[:, :, None] * a[:, None] + 1.0 - alpha[:, :, None]).sum(axis=1)
-        B, S = [[None] * 2 for _ in range(2)], [[None] * 2 for _ in range(2)]
-        for p in range(2):
-            for q in range(2):
-                B[p][q] = B1[:, p, q, None] * b + B2[:, p, q, None]
-                S[p][q] = B[p][q] + G1[:, p, q, None] * a + G2[:, p, q, None]
-        return size + np.log((B[0][0] * B[1][1] - B[0][1] ** 2) / (S[0][0] * S[1][1] - S[0][1] ** 2))
+        a, b = 1.0 / w[:, None], 1.0 / (1.0 - w[:, None, None])
+        size = np.log(alpha[:, :, None] * a + 1.0 - alpha[:, :, None]).sum(axis=1)
+        B = B1[..., None] * b + B2[..., None]
+        S = B + G1[..., None] * a[:, None] + G2[..., None]
+        return size + np.log(_det(B) / _det(S))
 
-    low, high = np.zeros(len(A1)), np.ones(len(A1))
+    low, high, middle = np.zeros(len(A1)), np.ones(len(A1)), np.full(len(A1), 0.5)
     for _ in range(3):
         w = low[:, None] + (high - low)[:, None] * GRID
         best = np.argmin(log_det(w), axis=1)
@@ -241,6 +238,11 @@ def _intersected(
     A, B = A1 / w + A2, B1 / (1.0 - w) + B2
     found = update(_unit(A, 3), H, B, np.eye(2))
     return found.x, found.P
+
+
+def _det(A: np.ndarray) -> np.ndarray:
+    """Determinants of 2×2 matrices (items, 2, 2, weights)."""
+    return A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0]
 
 
 def _unit(P: np.ndarray, d: int) -> Estimate:
@@ -371,14 +373,11 @@ class Expected:
         size = np.array([event.measured[0], 1.0])
         columns = first + np.array([[4, 5, 8 + event.subject], [6, 7, 8 + self.subjects + event.subject]])
         white = size**2 * np.array([self.noises.range.white[i], self.noises.bearing.white[i]])
-        HE, HM = 0.0, 0.0
-        for robot, h in H.items():
-            block = slice(3 * robot, 3 * robot + 3)
-            HE, HM = HE + h @ self.E[:, block], HM + h @ self.M[:, block]
         # y = −He + Bb + v
+        HE = sum(h @ self.E[:, 3 * robot : 3 * robot + 3] for robot, h in H.items())
+        yb = -np.asarray(sum(h @ self.M[:, 3 * robot : 3 * robot + 3] for robot, h in H.items()))
         eB = self.M[:, :, columns].sum(axis=-1) * size
         ey = eB - NUMPY.transpose(HE)
-        yb = -HM
         for m in range(2):
             yb[:, m, columns[m]] += size[m] * self.variance[columns[m]]
         yB = yb[:, :, columns].sum(axis=-1) * size

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -150,9 +151,7 @@ def run_robots(
     return RobotRun(used, noises, until, runs, white, tuple(rows), alone.error, alone.deviation)
 
 
-def _check(
-    record: RobotRecord, link: Sequence[float], estimators: Sequence[str], runs: int, until: float
-) -> None:
+def _check(record: RobotRecord, link: Sequence[float], estimators: Sequence[str], runs: int, until: float) -> None:
     end = (record.steps - 1) * record.interval
     if end < until + SHORTEST:
         raise UsageError(
@@ -186,7 +185,7 @@ class _Items(NamedTuple):
         u = np.random.default_rng([seed, int(other)]).random((runs, pairs, 2))
         parts = [u[: 1 if value in (0.0, 1.0) else runs] < value for value in link]
         ends = np.cumsum([0, *map(len, parts)])
-        pieces = tuple(slice(int(a), int(b)) for a, b in zip(ends, ends[1:], strict=False))
+        pieces = tuple(slice(int(a), int(b)) for a, b in pairwise(ends))
         return cls(np.concatenate(parts), tuple(link), pieces)
 
 
@@ -243,9 +242,7 @@ def _expected(
             continue
         E = expected.blocks()
         nees = np.trace(np.linalg.solve(moment.claims, E), axis1=-2, axis2=-1)
-        found.append(
-            (E[..., [0, 1], [0, 1]].sum(axis=-1), moment.claims[..., [0, 1], [0, 1]].sum(axis=-1), nees)
-        )
+        found.append((E[..., [0, 1], [0, 1]].sum(axis=-1), moment.claims[..., [0, 1], [0, 1]].sum(axis=-1), nees))
     return _Found(*map(np.array, zip(*found, strict=True)))
 
 
@@ -264,6 +261,6 @@ def _rows(name: str, record: RobotRecord, real: _Found, expected: _Found, items:
             if average is None:
                 raise UsageError(f"{record.source}: expected errors that can be told, got none")
             number = None if agent is None else record.robots[agent]
-            means = (float(np.mean(values[of])) for values in (realised, claimed, predicted))
-            rows.append(RobotRow(name, number, link, *means, average, float(np.mean(nees[of]))))
+            real_, claim, expect, nees_ = (float(np.mean(v[of])) for v in (realised, claimed, predicted, nees))
+            rows.append(RobotRow(name, number, link, real_, claim, expect, average, nees_))
     return rows

@@ -233,13 +233,11 @@ def _on_clock(
         raise table.error(
             int(stranger[0]), "robot", f"one of {', '.join(map(str, robots))}, as in odometry.csv", robot[stranger[0]]
         )
-    assert times is not None  # noqa: S101  (there is a robot)
+    assert times is not None
     return times, np.stack(values, axis=1)
 
 
-def _sightings(
-    table: Columns, numbers: tuple[int, ...], n: int, times: np.ndarray, odometry: np.ndarray
-) -> Sightings:
+def _sightings(table: Columns, numbers: tuple[int, ...], n: int, times: np.ndarray, odometry: np.ndarray) -> Sightings:
     time, place = table.number["time"], {number: at for at, number in enumerate(numbers)}
     robot, subject = (np.array([place.get(int(v), -1) for v in table.number[c]]) for c in ("robot", "subject"))
     for column, wrong, expected in (
@@ -291,9 +289,8 @@ def _check_units(record: RobotRecord, folder: Path) -> None:
         ("sightings", "range", "m", np.median(sightings.range / np.maximum(expected[:, 0], 1e-9))),
     ):
         if not 1.0 / FACTOR < ratio < FACTOR:
-            raise UsageError(
-                f"{folder / file}.csv, column '{column}': expected {unit} as truth.csv has it, got {ratio:.3g} times that"
-            )
+            wanted = f"expected {unit} as truth.csv has it"
+            raise UsageError(f"{folder / file}.csv, column '{column}': {wanted}, got {ratio:.3g} times that")
     if beside > ASIDE:
         raise UsageError(
             f"{folder / 'sightings.csv'}, column 'bearing': expected rad from the heading, anticlockwise, got "
