@@ -25,7 +25,8 @@ of one, two or all robots.  So the same filters run on
                 carries E and M on exactly; b's own covariance is diagonal and stays so.  This is a consider analysis
                 (Schmidt 1966) of the filters as they are: their gains come from the white noises that they assume.
 
-A sighting of more than `GATE` of the innovation's own covariance is left out (a misread barcode).
+On the record a sighting of more than `GATE` of the innovation's own covariance is left out (a misread barcode), unless
+`AGAIN` of the robot's sightings in a row were: then it is the robot that errs.
 """
 
 from __future__ import annotations
@@ -46,6 +47,8 @@ GATE = 40.0
 """Squared normalised innovation (two degrees of freedom: 2e-9 by chance) that is no sighting of this subject."""
 GRID = (np.arange(24) + 0.5) / 24.0
 """Weights tried, of the interval at hand."""
+AGAIN = 8
+"""Sightings left out in a row after which the next is believed."""
 START = 0.05
 """Deviation of the first estimates from the truth that the filters assume [m, rad]; they begin at the truth."""
 
@@ -183,7 +186,7 @@ class Claims:
             there = fine[:, k, None, None]
             gains.append(np.where(there, K, 0.0))
             self.P[:, robot] = np.where(there, P, before[:, k])
-            if self.own is not None:
+            if self.own is not None and own is not None:
                 self.own[:, robot] = np.where(there, own, self.own[:, robot])
         return np.concatenate(gains, axis=1)
 
@@ -281,8 +284,8 @@ class Carried(Protocol):
         """Where to linearise, (items or 1, robots, 3)."""
         ...
 
-    def valid(self, y: np.ndarray, S: np.ndarray) -> np.ndarray:
-        """Which innovations to take, (items, 1, 1)."""
+    def valid(self, robot: int, y: np.ndarray, S: np.ndarray) -> np.ndarray:
+        """Which innovations of a robot to take, (items, 1, 1)."""
         ...
 
     def correct(self, event: Event, rows: list[int], K: np.ndarray, H: dict[int, np.ndarray], y: np.ndarray) -> None:
@@ -296,6 +299,7 @@ class Followed:
     def __init__(self, course: Course, items: int) -> None:
         self.course = course
         self.x = np.broadcast_to(course.record.truth[0], (items, *course.record.truth.shape[1:])).copy()
+        self.left_out = np.zeros(self.x.shape[:2], dtype=int)
 
     def move(self, step: int) -> np.ndarray:
         self.x, F = moved(self.x, self.course.motion[step - 1], self.course.record.interval)
@@ -304,9 +308,12 @@ class Followed:
     def states(self, step: int) -> np.ndarray:
         return self.x
 
-    def valid(self, y: np.ndarray, S: np.ndarray) -> np.ndarray:
+    def valid(self, robot: int, y: np.ndarray, S: np.ndarray) -> np.ndarray:
         off = y[..., None]
-        return NUMPY.transpose(off) @ np.linalg.solve(S, off) <= GATE
+        distance = (NUMPY.transpose(off) @ np.linalg.solve(S, off))[:, 0, 0]
+        fine = (distance <= GATE) | (self.left_out[:, robot] >= AGAIN)
+        self.left_out[:, robot] = np.where(fine, 0, self.left_out[:, robot] + 1)
+        return fine[:, None, None]
 
     def correct(self, event: Event, rows: list[int], K: np.ndarray, H: dict[int, np.ndarray], y: np.ndarray) -> None:
         change = (K @ y[..., None])[..., 0]
@@ -343,7 +350,7 @@ class Expected:
     def states(self, step: int) -> np.ndarray:
         return self.path[None, step]
 
-    def valid(self, y: np.ndarray, S: np.ndarray) -> np.ndarray:
+    def valid(self, robot: int, y: np.ndarray, S: np.ndarray) -> np.ndarray:
         return np.ones((len(S), 1, 1), dtype=bool)
 
     def move(self, step: int) -> np.ndarray:
@@ -429,12 +436,12 @@ def filtered(
             y[..., 1] = wrapped(y[..., 1])
             R = np.diag(assumed.R[i] * np.array([event.measured[0] ** 2, 1.0]))
             if subject >= n:
-                K = claims.landmark(i, H_i, R, lambda S, y=y: carried.valid(y, S))
+                K = claims.landmark(i, H_i, R, lambda S, i=i, y=y: carried.valid(i, y, S))
                 carried.correct(event, everyone if claims.joint else [i], K, {i: H_i}, y)
                 continue
             H_j = np.concatenate([-H_i[..., :2], np.zeros((*H_i.shape[:-1], 1))], axis=-1)
             arrived = heard[:, event.at]
-            K = claims.robot((i, subject), (H_i, H_j), R, arrived, lambda S, y=y: carried.valid(y, S))
+            K = claims.robot((i, subject), (H_i, H_j), R, arrived, lambda S, i=i, y=y: carried.valid(i, y, S))
             if K is not None:
                 carried.correct(event, everyone if claims.joint else [i, subject], K, {i: H_i, subject: H_j}, y)
         yield Moment(step, claims.blocks())
