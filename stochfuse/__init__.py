@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from stochfuse.data.crosscheck import check_results as check_results
     from stochfuse.data.crosscheck import crosscheck as crosscheck
     from stochfuse.data.results import read_results as read_results
+    from stochfuse.data.robot_run import RobotRun as RobotRun
+    from stochfuse.data.robot_run import run_robots as run_robots
     from stochfuse.data.run import RunResult as RunResult
     from stochfuse.data.run import run as run
     from stochfuse.data.simulate import simulate as simulate
@@ -80,6 +82,7 @@ _HOME = {
     "MessageLoad": "questions.messages",
     "NoAnswerError": "errors",
     "Prediction": "prediction.result",
+    "RobotRun": "data.robot_run",
     "RunResult": "data.run",
     "Scenario": "scenario.scenario",
     "ScenarioError": "errors",
@@ -111,6 +114,7 @@ _HOME = {
     "predict_states": "prediction.states",
     "read_results": "data.results",
     "run": "data.run",
+    "run_robots": "data.robot_run",
     "sensitivity": "questions.sensitivity",
     "share_of_gain": "questions.sensitivity",
     "simulate": "data.simulate",
@@ -129,6 +133,7 @@ __all__ = [
     "MessageLoad",
     "NoAnswerError",
     "Prediction",
+    "RobotRun",
     "RunResult",
     "Scenario",
     "ScenarioError",
@@ -161,6 +166,7 @@ __all__ = [
     "predict_states",
     "read_results",
     "run",
+    "run_robots",
     "scenario",
     "sensitivity",
     "share_of_gain",

@@ -188,13 +188,12 @@ def show_robots(
     """Run estimators on a record of robots, and write the report."""
     from stochfuse.data.robot_filters import ESTIMATORS as TAKEN
     from stochfuse.data.robot_run import run_robots
-    from stochfuse.data.robots import read_robots
     from stochfuse.report.robots import robot_report
 
     links = parse_link("0:1:0.25" if link is None else link)
     found = run_robots(
-        read_robots(str(robots.data)), links, names or TAKEN, runs=robots.runs, seed=seed, landmarks=robots.landmarks,
-        until=robots.until, white=robots.white,
+        str(robots.data), links, names or TAKEN, runs=robots.runs, seed=seed, landmarks=robots.landmarks,
+        until=robots.until, noises="white" if robots.white else "identified",
     )  # fmt: skip
     written.write(robot_report(found, min(written.digits, 3)))
 

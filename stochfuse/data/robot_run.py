@@ -17,7 +17,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
+from pathlib import Path
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -33,10 +34,11 @@ from stochfuse.data.robot_filters import (
     course,
     filtered,
 )
-from stochfuse.data.robots import RobotRecord, wrapped
+from stochfuse.data.robots import RobotRecord, read_robots, wrapped
 from stochfuse.engines.progress import listener
 from stochfuse.errors import UsageError, nearest
 from stochfuse.scenario import registry
+from stochfuse.scenario.result import Result
 
 UNTIL = 60.0
 FORGOTTEN = 10.0
@@ -74,8 +76,8 @@ class RobotRow(NamedTuple):
         return self.nees.verdict
 
 
-@dataclass(frozen=True, eq=False)
-class RobotRun:
+@dataclass(frozen=True, eq=False, repr=False)
+class RobotRun(Result):
     """Estimators on a record of robots.
 
     Parameters
@@ -104,7 +106,7 @@ class RobotRun:
 
 
 def run_robots(
-    record: RobotRecord,
+    record: RobotRecord | str | Path,
     link: Sequence[float] = (0.0, 0.25, 0.5, 0.75, 1.0),
     estimators: Sequence[str] = ESTIMATORS,
     *,
@@ -112,28 +114,30 @@ def run_robots(
     seed: int = 1,
     landmarks: int | None = None,
     until: float = UNTIL,
-    white: bool = False,
+    noises: Noises | Literal["identified", "white"] = "identified",
 ) -> RobotRun:
     """Run estimators on a record of robots.
 
     Parameters
     ----------
-    record : as `stochfuse.data.robots.read_robots` reads it.
+    record : a folder, or what `stochfuse.data.robots.read_robots` made of it.
     link : probabilities that a message arrives.
     estimators : names, of those that agents with states of their own have.
     runs, seed : draws of arrivals for each link probability.
     landmarks : how many the filters may use; noises are identified with all of them.
     until : seconds to identify noises on.
-    white : take the noises that were identified for white at face value, in filters and prediction.
+    noises : as identified; "white": the same taken for white at face value, in filters and prediction; or others.
 
     Raises
     ------
     UsageError
         If an estimator does not apply, the record is too short, or a number is out of range.
     """
+    record = read_robots(record) if isinstance(record, str | Path) else record
     _check(record, link, estimators, runs, until)
-    noises = identify(record, 0.0, until)
-    noises = noises.white() if white else noises
+    white = noises == "white"
+    if isinstance(noises, str):
+        noises = identify(record, 0.0, until).white() if white else identify(record, 0.0, until)
     used = record if landmarks is None else record.with_landmarks(landmarks)
     course_, last = course(used, noises), record.step_at(until)
     told = assumed(record, noises, last)

@@ -31,9 +31,9 @@ def gauss_markov(rng, deviation, time, interval, steps):
     return b
 
 
-def write(folder, seed, drawn=Drawn(), robots=3, landmarks=8, seconds=120.0, interval=0.2):
+def write(folder, seed, drawn=None, robots=3, landmarks=8, seconds=120.0, interval=0.2):
     """Write a folder: robots that drive about in a hall of 8 m by 8 m, and see what is before them each second step."""
-    rng = np.random.default_rng(seed)
+    rng, drawn = np.random.default_rng(seed), drawn or Drawn()
     steps = round(seconds / interval) + 1
     around = [(4.5 * cos(2 * pi * m / landmarks), 4.5 * sin(2 * pi * m / landmarks)) for m in range(landmarks)]
     tables = {
