@@ -387,9 +387,9 @@ class Expected:
         ey = eB - NUMPY.transpose(HE)
         for m in range(2):
             yb[:, m, columns[m]] += size[m] * self.variance[columns[m]]
-        yB = yb[:, :, columns].sum(axis=-1) * size
+        By = NUMPY.transpose(yb[:, :, columns].sum(axis=-1) * size)
         He_y = sum(h @ ey[:, 3 * robot : 3 * robot + 3] for robot, h in H.items())
-        yy = yB - He_y + white * np.eye(2)
+        yy = By - He_y + white * np.eye(2)
         at = (3 * np.array(rows)[:, None] + np.arange(3)).ravel()
         change = K @ NUMPY.transpose(ey)
         self.E[:, at] += change
