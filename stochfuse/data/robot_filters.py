@@ -32,7 +32,7 @@ On the record a sighting of more than `GATE` of the innovation's own covariance 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -126,10 +126,8 @@ class Claims:
     def __init__(self, estimator: str, items: int, robots: int) -> None:
         self.estimator, self.n = estimator, robots
         self.joint = estimator == "itns"
-        start = START**2 * np.eye(3)
-        self.P = np.broadcast_to(np.eye(3 * robots) * START**2, (items, 3 * robots, 3 * robots)).copy()
-        if not self.joint:
-            self.P = np.broadcast_to(start, (items, robots, 3, 3)).copy()
+        shape = (3 * robots, 3 * robots) if self.joint else (robots, 3, 3)
+        self.P = np.broadcast_to(START**2 * np.eye(shape[-1]), (items, *shape)).copy()
         self.own = np.zeros_like(self.P) if estimator == "split-ci" else None
 
     def blocks(self) -> np.ndarray:
@@ -155,8 +153,7 @@ class Claims:
         K = np.where(fine, found.x, 0.0)
         self.P[:, i] = np.where(fine, found.P, P)
         if self.own is not None:
-            A = np.eye(3) - K @ H
-            self.own[:, i] = A @ self.own[:, i] @ NUMPY.transpose(A) + K @ R @ NUMPY.transpose(K)
+            self.own[:, i] = corrected(self.own[:, i], K, H, R)
         return K
 
     def robot(
@@ -273,28 +270,12 @@ def _diagonal(blocks: np.ndarray) -> np.ndarray:
     return whole
 
 
-class Carried(Protocol):
-    """What is carried along with the claims."""
-
-    def move(self, step: int) -> np.ndarray:
-        """Go on to a step; return the transition's Jacobians (items or 1, robots, 3, 3)."""
-        ...
-
-    def states(self, step: int) -> np.ndarray:
-        """Where to linearise, (items or 1, robots, 3)."""
-        ...
-
-    def valid(self, robot: int, y: np.ndarray, S: np.ndarray) -> np.ndarray:
-        """Which innovations of a robot to take, (items, 1, 1)."""
-        ...
-
-    def correct(self, event: Event, rows: list[int], K: np.ndarray, H: dict[int, np.ndarray], y: np.ndarray) -> None:
-        """Take in what was seen with a gain (items, 3·rows, 2)."""
-        ...
-
-
 class Followed:
-    """The record itself: states (items, robots, 3)."""
+    """The record itself: states (items, robots, 3).
+
+    What is carried along with the claims moves on to a step (returns the Jacobians), says where to linearise and which
+    innovations y to take, and takes a sighting in: gain K (items, 3·rows, 2) on the rows of some robots.
+    """
 
     def __init__(self, course: Course, items: int) -> None:
         self.course = course
@@ -399,14 +380,19 @@ class Expected:
 
 
 class Moment(NamedTuple):
-    """A step of filters: claims (items, robots, 3, 3), and what is carried."""
+    """A step of filters and its claims (items, robots, 3, 3); what is carried along is to be read at once."""
 
     step: int
     claims: np.ndarray
 
 
 def filtered(
-    course: Course, estimator: str, assumed: Assumed, heard: np.ndarray, carried: Carried, last: int | None = None
+    course: Course,
+    estimator: str,
+    assumed: Assumed,
+    heard: np.ndarray,
+    carried: Followed | Expected,
+    last: int | None = None,
 ) -> Iterator[Moment]:
     """Run one estimator, step by step.
 
