@@ -131,7 +131,16 @@ def run_robots(
     Raises
     ------
     UsageError
-        If an estimator does not apply, the record is too short, or a number is out of range.
+        If the folder is spoilt, an estimator does not apply, the record is too short, or a number is out of range.
+
+    Examples
+    --------
+    >>> from stochfuse import UsageError, run_robots
+    >>> try:
+    ...     run_robots("mrclam", link=[0, 0.5, 1], estimators=["split-ci"])
+    ... except UsageError as error:
+    ...     print(error)
+    mrclam: expected a folder with odometry.csv, sightings.csv, truth.csv, landmarks.csv, found none
     """
     record = read_robots(record) if isinstance(record, str | Path) else record
     _check(record, link, estimators, runs, until)
