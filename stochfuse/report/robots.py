@@ -14,6 +14,8 @@ from stochfuse.report.runs import SCHEMA
 from stochfuse.report.table import Report, Table, number, to_csv
 
 METRIC = "rms:x,y"
+POINTS = 400
+"""Points of a curve over time."""
 CHANNELS = (("speed", "of speed"), ("turn", "of turn rate"), ("range", "of range"), ("bearing", "rad"))
 
 
@@ -134,10 +136,11 @@ def draw_robots(found: RobotRun) -> Any:
     left.set_xlabel("link probability µ")
     left.set_ylabel("RMS of position [m]")
     left.set_title("realised (dots), predicted (dashed)", fontsize="small")
-    seconds = np.arange(found.record.steps) * found.record.interval
+    shown = slice(None, None, max(1, found.record.steps // POINTS))
+    seconds = np.arange(found.record.steps)[shown] * found.record.interval
     for place, robot in enumerate(found.record.robots):
-        distance = np.hypot(found.alone[:, place, 0], found.alone[:, place, 1])
-        deviation = np.hypot(found.alone_deviation[:, place, 0], found.alone_deviation[:, place, 1])
+        distance = np.hypot(*found.alone[shown, place, :2].T)
+        deviation = np.hypot(*found.alone_deviation[shown, place, :2].T)
         color = COLORS[place % len(COLORS)]
         right.plot(seconds, distance, color=color, linewidth=1.3, label=f"robot {robot}")
         right.plot(seconds, deviation, color=color, linewidth=1.0, dashes=(4, 2))
