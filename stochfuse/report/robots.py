@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,7 @@ def _titles(found: RobotRun) -> tuple[str, ...]:
     landmarks = int((seen >= len(record.robots)).sum())
     end = (record.steps - 1) * record.interval
     return (
-        f"Robots of {record.source}: root mean square error of position [m], mean over robots",
+        f"Robots of {Path(record.source).name}: root mean square error of position [m], mean over robots",
         f"{len(record.robots)} robots, {landmarks} landmarks; noises identified on the first {found.until:g} s, with "
         f"the truth{', and taken for white' if found.white else ''}; shown: the rest, to {end:g} s",
         "realised: x̂ − x, over draws of arrivals; predicted: over noises and arrivals, without the truth",
