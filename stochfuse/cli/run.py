@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -20,12 +21,14 @@ from stochfuse.cli.options import (
     MetricOption,
     PlotOption,
     ScenarioArgument,
+    Written,
     check_files,
     chosen_format,
     completed,
     named,
     option,
     pairs,
+    parse_link,
     write_report,
 )
 from stochfuse.errors import UsageError
@@ -37,6 +40,7 @@ if TYPE_CHECKING:
 EXAMPLES = (
     "stochfuse run my.toml --measurements z.csv --arrivals heard.csv --truth x.csv",
     "stochfuse run my.toml --measurements z.csv --link 0.5 --estimator optimal",
+    "stochfuse run utias --data mrclam --link 0:1:0.25 --estimator split-ci,itns",
 )
 EstimatorsOption = Annotated[
     str | None,
@@ -59,6 +63,32 @@ CriterionOption = Annotated[
         f"intersections: what the weights minimise, {', '.join(CRITERIA)}; default: det.", WORK + RARE, metavar="NAME"
     ),
 ]
+ROBOTS = "utias"
+"""What stands for a scenario where robots' records are run."""
+
+
+class RobotOptions(NamedTuple):
+    """A record of robots that see landmarks and one another."""
+
+    data: Annotated[
+        Path | None,
+        option(
+            f"{ROBOTS}: folder with odometry, sightings, truth and landmarks (.csv).", SCENARIO, "--data",
+            metavar="FOLDER",
+        ),
+    ] = None  # fmt: skip
+    landmarks: Annotated[
+        int | None, option(f"{ROBOTS}: landmarks that filters may use; default: all.", SCENARIO, min=1, metavar="N")
+    ] = None
+    until: Annotated[
+        float, option(f"{ROBOTS}: seconds to identify noises on; default: 60.", SCENARIO + RARE, metavar="SECONDS")
+    ] = 60.0
+    runs: Annotated[
+        int, option(f"{ROBOTS}: draws of arrivals per link; default: 4.", NETWORK + RARE, min=1, metavar="N")
+    ] = 4
+    white: Annotated[bool, option(f"{ROBOTS}: take what was identified for white noise.", WORK + RARE, "--white")] = (
+        False
+    )
 
 
 def run(
@@ -87,6 +117,7 @@ def run(
         str | None, option("The files' names of columns: z1=range,step=k.", SCENARIO + RARE, metavar="OURS=THEIRS")
     ] = None,
     changes: Changes = Changes(),
+    robots: RobotOptions = RobotOptions(),
     seed: Annotated[int, option("Of arrivals that are drawn; default: 1.", NETWORK, min=0, metavar="N")] = 1,
     case: CaseOption = None,
     estimator: EstimatorsOption = None,
@@ -111,9 +142,21 @@ def run(
     from stochfuse.data.writing import EstimatesFile
     from stochfuse.kalman.metrics import metric as metric_of
 
+    names = None if estimator is None else named(estimator)
+    if scenario == ROBOTS:
+        others = {
+            "measurements": measurements, "arrivals": arrivals, "truth": truth, "initial": initial, "columns": columns,
+            "output": output, "criterion": None if criterion == "det" else criterion, "covariance": covariance or None,
+            **changes._replace(link=None)._asdict(),
+        }  # fmt: skip
+        check_robots(robots, others, metric)
+        check_files(None, plot)
+        show_robots(robots, changes.link, names, seed, Written(format, None, plot, digits))
+        return
+    if robots != RobotOptions():
+        raise UsageError(f"--data, --landmarks, --until, --runs, --white: expected with {ROBOTS} alone, got {scenario}")
     if measurements is None:
         raise UsageError("--measurements: expected a file of measurements, got none")
-    names = None if estimator is None else named(estimator)
     files = [file for file in (measurements, arrivals, truth, initial) if file is not None]
     if [*files, scenario].count("-") > 1:
         raise UsageError("expected at most one file on standard input, got - for several")
@@ -132,6 +175,33 @@ def run(
     with writing as file:
         found = run_records(records, chosen, way, None if file is None else file.write)
     show(found, format, plot, digits)
+
+
+def check_robots(robots: RobotOptions, others: Mapping[str, object], metric: str | None) -> None:
+    """Raise UsageError if an option does not go with a record of robots, or its folder is not given."""
+    if robots.data is None:
+        raise UsageError(f"--data: expected a folder with a record of robots, as {ROBOTS} needs one, got none")
+    given = [name for name, value in others.items() if value is not None]
+    if given:
+        raise UsageError(f"--{given[0]}: expected a scenario, got {ROBOTS}, whose record is all in --data")
+    if metric not in (None, "rms:x,y"):
+        raise UsageError(f"--metric: expected rms:x,y with {ROBOTS}, got {metric}")
+
+
+def show_robots(
+    robots: RobotOptions, link: str | None, names: tuple[str, ...] | None, seed: int, written: Written
+) -> None:
+    """Run estimators on a record of robots, and write the report."""
+    from stochfuse.data.robot_filters import ESTIMATORS as TAKEN
+    from stochfuse.data.robot_run import run_robots
+    from stochfuse.report.robots import robot_report
+
+    links = parse_link("0:1:0.25" if link is None else link)
+    found = run_robots(
+        str(robots.data), links, names or TAKEN, runs=robots.runs, seed=seed, landmarks=robots.landmarks,
+        until=robots.until, noises="white" if robots.white else "identified",
+    )  # fmt: skip
+    written.write(robot_report(found, min(written.digits, 3)))
 
 
 def show(found: RunResult, format: str | None, plot: Path | None, digits: int) -> None:

@@ -8,6 +8,8 @@ results beside the prediction and says what would explain a difference.
     run, consistency          estimators on records; are they as good as they claim
     innovations, suspicions   how likely a record is; what would explain that it is not
     draw, simulate            records that chance decides
+    robots, robot_errors      a record of robots that see one another; how its sensors err, with memory
+    robot_filters, robot_run  estimators on it, and the true errors that they should have
     tables, columns           a table from wherever it is, as NumPy columns; what is wrong by line and column
     results                   what a simulator found
     expected                  what its values are distributed like

@@ -9,6 +9,7 @@ import numpy as np
 
 from stochfuse.data.crosscheck import Verdict
 from stochfuse.data.protocols import ProtocolLoad
+from stochfuse.data.robot_run import RobotRun
 from stochfuse.data.run import RunResult
 from stochfuse.errors import UsageError, needed
 from stochfuse.estimators.fusion_graph import FusionGraph
@@ -37,6 +38,7 @@ from stochfuse.report import (
 from stochfuse.report.critical import critical_report
 from stochfuse.report.plot import figure_class
 from stochfuse.report.predictions import PredictionView
+from stochfuse.report.robots import robot_report
 from stochfuse.report.runs import run_report
 from stochfuse.report.states import StatesView, states_report
 from stochfuse.report.table import Report, to_html, to_text
@@ -76,6 +78,8 @@ def report_of(result: Any, of: str | None = None, agent: int | str = "mean") -> 
         return links.links_report(result)
     if isinstance(result, RunResult):
         return run_report(result)
+    if isinstance(result, RobotRun):
+        return robot_report(result)
     if isinstance(result, ExpectedStates):
         return states_report(StatesView(result, agent))
     if isinstance(result, Verdict):

@@ -55,7 +55,7 @@ RUN = [
     pytest.param(example, marks=pytest.mark.slow) if example in LONG else example
     for name in PLAIN
     for example in import_module(f"stochfuse.cli.{name}").EXAMPLES
-    if not any(word in example for word in (".toml", ".csv", "means.json"))
+    if not any(word in example for word in (".toml", ".csv", "means.json", "--data"))
 ]
 
 
