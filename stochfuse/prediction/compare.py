@@ -220,8 +220,8 @@ def _estimated(
         return predict(scenario, link, method, quantity, estimator=estimator, **settings)
     easy = {"max_graphs": EASY, **settings}
     every = settings["over"].scenarios if "over" in settings else (scenario,)
-    exchange = max(_exchange(some, link) for some in every)
-    if {"runs", "seed", "workers"} & set(settings) or exchange > EASY_EXCHANGE:
+    bits = max(exchange(some, link) for some in every)
+    if {"runs", "seed", "workers"} & set(settings) or bits > EASY_EXCHANGE:
         return predict(scenario, link, MONTE_CARLO, quantity, estimator=estimator, **settings)
     try:
         return predict(scenario, link, GENERAL, quantity, estimator=estimator, **easy)
@@ -229,7 +229,7 @@ def _estimated(
         return predict(scenario, link, MONTE_CARLO, quantity, estimator=estimator, **settings)
 
 
-def _exchange(scenario: Scenario, link: Any) -> float:
+def exchange(scenario: Scenario, link: Any) -> float:
     """Binary logarithm of the outcomes of one exchange."""
     network = scenario.network
     return len(events(network, link_rows(scenario, link), 1)) * log2(len(network.delay) + 1)
