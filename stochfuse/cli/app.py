@@ -28,6 +28,7 @@ COMMANDS = (
     "crosscheck",
     "reproduce",
     "study",
+    "explore",
     "links",
     "scenario",
     "methods",

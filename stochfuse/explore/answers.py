@@ -9,26 +9,28 @@ from __future__ import annotations
 
 import csv
 import io
+import shlex
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from stochfuse.engines.progress import Progress, listening
-from stochfuse.errors import StochfuseError, TooManyError
+from stochfuse.errors import StochfuseError, TooManyError, UsageError
 from stochfuse.explore.network import Picture, picture
 from stochfuse.explore.state import COARSE, FINE, POWER, ROUGH, RUNS, Asked, links_of
-from stochfuse.kalman.metrics import Metric
 from stochfuse.prediction.compare import EASY, EASY_EXCHANGE, EstimatorComparison, compare_estimators, exchange
 from stochfuse.prediction.predict import predict_several
 from stochfuse.questions.least_link import least_link
 from stochfuse.questions.messages import RULES, message_load
 from stochfuse.questions.sensitivity import sensitivity
+from stochfuse.report import document
 from stochfuse.report.comparisons import EstimatorView, estimator_report
 from stochfuse.report.predictions import WIDTH_95, PredictionView, predict_csv
 from stochfuse.report.predictions import report as predictions_report
-from stochfuse.report.results import report_of
+from stochfuse.report.plot import figure_class
 from stochfuse.report.table import Report, to_csv
 from stochfuse.scenario.registry import GENERAL, MONTE_CARLO, OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.scenario import Scenario
@@ -93,9 +95,13 @@ def quick(asked: Asked) -> Iterator[tuple[str, Callable[[], Any]]]:
     """Questions whose answers come at once, by name, in the order of their hardness."""
     yield SIMPLIFIED, lambda: _predicted(asked, SIMPLIFIED)
     yield "network", lambda: picture(asked)
+    yield "sensitivity", lambda: _with_sensitivity(asked)
+
+
+def least(asked: Asked) -> Iterator[tuple[str, Callable[[], Any]]]:
+    """The question that a dragged target asks again and again."""
     if asked.target is not None:
         yield "least", lambda: _least(asked)
-    yield "sensitivity", lambda: _with_sensitivity(asked)
 
 
 def exact(asked: Asked) -> Iterator[tuple[str, Callable[[], Any]]]:
@@ -212,10 +218,11 @@ class Work:
     ----------
     deliver : told a question's number, the name of an answer, and the answer; or an error; or a text of how far it is,
         by the name "progress"; or None by the name "done".  Called from the thread.
+    jobs : what is asked in turn; what comes behind the first waits until not too much is being done.
     """
 
-    def __init__(self, deliver: Callable[[int, str, Any], None]) -> None:
-        self._deliver = deliver
+    def __init__(self, deliver: Callable[[int, str, Any], None], jobs: Sequence[Any] = (quick, exact)) -> None:
+        self._deliver, self._jobs = deliver, jobs
         self.number = 0
 
     def ask(self, asked: Asked) -> int:
@@ -231,13 +238,15 @@ class Work:
     def _follow(self, number: int, asked: Asked) -> None:
         try:
             with listening(_Listener(self, number)):
-                for name, job in quick(asked):
+                first, *behind = self._jobs
+                for name, job in first(asked):
                     self._answer(number, name, job)
-                with AT_ONCE:
-                    for name, job in exact(asked):
+                with AT_ONCE if behind else nullcontext():
+                    for name, job in (one for jobs in behind for one in jobs(asked)):
                         self.say(number, "progress", name)
                         self._answer(number, name, job)
-            self.say(number, "done", None)
+                if behind:
+                    self.say(number, "done", None)
         except Superseded:
             pass
 
@@ -286,11 +295,34 @@ def records(curves: Sequence[Curve]) -> str:
 
 
 def report(asked: Asked, curves: Sequence[Curve]) -> Report:
-    """Return what the curves show as a report: the estimators side by side, or where there are none the quick engines."""
-    names = [name for name in asked.estimators if any(curve.name == name for curve in curves)]
-    first = {name: next(c for c in curves if c.name == name).views[0].prediction for name in names}
-    if not first:
+    """Return what the curves show as a report: the estimators side by side, or without any the first quick engine."""
+    views = {curve.name: curve.views[0] for curve in curves}
+    found = [views[name].prediction for name in asked.estimators if name in views]
+    if not found:
         return predictions_report([curves[0].views[0]])
-    metric: Metric = asked.measure
-    view = EstimatorView(EstimatorComparison(tuple(first.values())), metric, asked.agent, quantities=asked.quantities)
-    return estimator_report(view)
+    compared = EstimatorComparison(tuple(found))
+    return estimator_report(EstimatorView(compared, asked.measure, asked.agent, quantities=asked.quantities))
+
+
+def page_of(asked: Asked, curves: Sequence[Curve]) -> str:
+    """Return a page to be sent, as --report writes it."""
+    words = asked.commands([c.name for c in curves if c.sampled])
+    chosen = next((line for line in words if " compare " in line), words[0])
+    said = dict.fromkeys(note for c in curves for view in c.views for note in view.prediction.notes)
+    told = document.Told(shlex.split(chosen)[1:], asked.scenario.to_mapping(), tuple(said))
+    return document.document(report(asked, curves), told)
+
+
+def figure_of(asked: Asked, curves: Sequence[Curve]) -> str:
+    """Return the figure, as --plot draws it.
+
+    Raises
+    ------
+    StochfuseError
+        If matplotlib is not installed.
+    """
+    draw = report(asked, curves).draw
+    if draw is None:
+        raise UsageError("there is no figure of this")
+    figure_class()
+    return document.vectors(draw())

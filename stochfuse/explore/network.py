@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from stochfuse.errors import StochfuseError
 from stochfuse.explore.state import Asked
 from stochfuse.prediction.predict import predict
 from stochfuse.report.network_figure import BEND, LEAST
@@ -126,7 +127,10 @@ def picture(asked: Asked) -> Picture:
     else:
         angle = 2 * np.pi * np.arange(n) / n
         places = np.stack([np.sin(angle), np.cos(angle)], axis=1)
-    found = predict(scenario, [asked.link] if asked.kind == "link" else None, SIMPLIFIED)
-    errors = np.array([found.values(asked.measure, i + 1)[0, -1] for i in range(n)])
+    try:
+        found = predict(scenario, [asked.link] if asked.kind == "link" else None, SIMPLIFIED)
+        errors = np.array([found.values(asked.measure, i + 1)[0, -1] for i in range(n)])
+    except StochfuseError:  # which the curves say
+        errors = np.full(n, np.nan)
     names = scenario.network.names or tuple(str(i + 1) for i in range(n))
     return Picture(names, places, bool(where), link, step, errors)

@@ -125,13 +125,8 @@ def _figure(report: Report, title: str) -> tuple[str, str]:
         drawn = report.draw()
     except StochfuseError as error:
         return "", f"no figure: {error}"
-    from matplotlib import rc_context
-
-    out = io.StringIO()
-    with rc_context({"svg.hashsalt": "stochfuse"}):
-        drawn.savefig(out, format="svg", metadata={"Date": None, "Creator": None})
+    svg = vectors(drawn)
     label = escape(f"Figure: {title}", quote=True)
-    svg = out.getvalue()
     if len(svg) <= MOST_VECTORS:
         picture = svg[svg.index("<svg") :].replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1)
     else:
@@ -140,6 +135,16 @@ def _figure(report: Report, title: str) -> tuple[str, str]:
         picture = f'<img alt="{label}" src="data:image/png;base64,{base64.b64encode(dots.getvalue()).decode()}">'
     box = '<input type="checkbox" id="larger" class="screen"><label for="larger" class="screen"> larger</label>'
     return f"{box}<figure>{picture}</figure>", ""
+
+
+def vectors(figure: Any) -> str:
+    """Return a figure of matplotlib's as SVG, the same whenever it is drawn."""
+    from matplotlib import rc_context
+
+    out = io.StringIO()
+    with rc_context({"svg.hashsalt": "stochfuse"}):
+        figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None})
+    return out.getvalue()
 
 
 def _words(tables: Sequence[Table], asked: Sequence[str]) -> str:
