@@ -12,7 +12,6 @@ import io
 import shlex
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -236,23 +235,24 @@ class Work:
         self.number += 1
 
     def _follow(self, number: int, asked: Asked) -> None:
+        first, *behind = self._jobs
         try:
-            with listening(_Listener(self, number)):
-                first, *behind = self._jobs
-                for name, job in first(asked):
+            for name, job in first(asked):
+                self._answer(number, name, job)
+            if not behind:
+                return
+            with AT_ONCE:
+                for name, job in (one for jobs in behind for one in jobs(asked)):
+                    self.say(number, "progress", name)
                     self._answer(number, name, job)
-                with AT_ONCE if behind else nullcontext():
-                    for name, job in (one for jobs in behind for one in jobs(asked)):
-                        self.say(number, "progress", name)
-                        self._answer(number, name, job)
-                if behind:
-                    self.say(number, "done", None)
+            self.say(number, "done", None)
         except Superseded:
             pass
 
     def _answer(self, number: int, name: str, job: Callable[[], Any]) -> None:
         try:
-            found = job()
+            with listening(_Listener(self, number, name)):
+                found = job()
         except (StochfuseError, MemoryError, ArithmeticError, np.linalg.LinAlgError) as error:
             found = error
         self.say(number, name, found)
@@ -275,13 +275,13 @@ class Superseded(Exception):  # noqa: N818
 
 
 class _Listener(Progress):
-    def __init__(self, work: Work, number: int) -> None:
-        self._work, self._number = work, number
+    def __init__(self, work: Work, number: int, name: str) -> None:
+        self._work, self._number, self._name = work, number, name
 
     def advance(self, what: str, done: int, total: int) -> None:
         """Hand on how far it is; what is no longer asked ends here."""
         share = f", {done:,} of {total:,}" if total else ""
-        self._work.say(self._number, "progress", f"{what}{share}")
+        self._work.say(self._number, "progress", f"{self._name}: {what}{share}")
 
 
 def records(curves: Sequence[Curve]) -> str:

@@ -6,6 +6,7 @@ Curves are told apart by colour (Okabe and Ito's) and by dashes; words in a figu
 from __future__ import annotations
 
 from collections.abc import Sequence
+from html import escape
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,10 +15,7 @@ from bokeh.models import (
     ColorBar,
     ColumnDataSource,
     HoverTool,
-    Legend,
-    LegendItem,
     LinearColorMapper,
-    MultiLine,
     PlainText,
     Span,
     TapTool,
@@ -66,7 +64,6 @@ class Chart:
     ----------
     label : what the figure shows, for those who do not see it.
     height : in pixels.
-    legend : whether there is one.
     """
 
     def __init__(self, label: str, height: int = 330) -> None:
@@ -76,17 +73,12 @@ class Chart:
         )  # fmt: skip
         self.figure.toolbar.logo = None
         self._label = label
-        self._lines = ColumnDataSource({key: [] for key in ("xs", "ys", "name", "color", "dash", "value")})
+        self._lines = ColumnDataSource({key: [] for key in ("xs", "ys", "name", "color", "dash")})
         self._bands = ColumnDataSource({"xs": [], "ys": [], "color": []})
         self.figure.patches("xs", "ys", source=self._bands, fill_color="color", fill_alpha=0.18, line_color=None)
-        drawn = self.figure.add_glyph(
-            self._lines, MultiLine(xs="xs", ys="ys", line_color="color", line_dash="dash", line_width=2.2)
+        drawn = self.figure.multi_line(
+            "xs", "ys", source=self._lines, line_color="color", line_dash="dash", line_width=2.2
         )
-        self._legend = Legend(
-            items=[LegendItem(label={"field": "name"}, renderers=[drawn])], ncols="auto", orientation="horizontal",
-            label_text_font_size="12px", spacing=8, padding=4, border_line_color=None,
-        )  # fmt: skip
-        self.figure.add_layout(self._legend, "below")
         self.figure.add_tools(HoverTool(renderers=[drawn], tooltips=[("", "@name"), ("x", "$x"), ("y", "$y")]))
 
     def show(self, lines: Sequence[tuple[str, str, str, Line]], x: str, y: str) -> None:
@@ -97,7 +89,6 @@ class Chart:
             "name": [name for name, *_ in lines],
             "color": [color for _, color, *_ in lines],
             "dash": [dash for _, _, dash, _ in lines],
-            "value": [float(line.y[-1]) for *_, line in lines],
         }
         bands = [(color, line) for _, color, _, line in lines if line.low is not None and line.high is not None]
         self._bands.data = {
@@ -121,7 +112,6 @@ class Chart:
     def dress(self, look: Look) -> None:
         """Put on the colours of a theme."""
         dress(self.figure, look)
-        self._legend.label_text_color, self._legend.background_fill_color = look.ink, look.back
         for line in self.figure.select({"type": Span}):
             line.line_color = line.hover_line_color = look.ink
 
@@ -136,6 +126,19 @@ def dress(plot: Any, look: Look) -> None:
         axis.axis_label_text_color = axis.major_label_text_color = look.ink
         axis.axis_line_color = axis.major_tick_line_color = axis.minor_tick_line_color = look.ink
         axis.axis_label_text_font_style, axis.axis_label_text_font_size = "normal", "13px"
+
+
+STROKES = {"solid": "", "dashed": "6", "dotted": "2 3", "dotdash": "2 3 6 3"}
+
+
+def key_of(lines: Sequence[tuple[str, str, str, Line]]) -> str:
+    """Return which line is whose, as HTML that flows."""
+    return "".join(
+        f'<span style="white-space: nowrap; margin-right: 14px"><svg width="30" height="10" aria-hidden="true"><line x1="0" '
+        f'x2="28" y1="6" y2="6" stroke="{color}" stroke-width="2.5" stroke-dasharray="{STROKES[dash]}"/></svg> '
+        f"{escape(name)}</span> "
+        for name, color, dash, _ in lines
+    )
 
 
 def lines_of(curves: Sequence[Curve], look: Look, along: str) -> list[tuple[str, str, str, Line]]:
@@ -162,7 +165,7 @@ class NetworkChart:
         self.figure.toolbar.logo = None
         keys = ("xs", "ys", "mu", "width", "name")
         self.links, self.heads = ColumnDataSource({k: [] for k in keys}), ColumnDataSource({k: [] for k in keys})
-        self.agents = ColumnDataSource({key: [] for key in ("x", "y", "error", "name", "label")})
+        self.agents = ColumnDataSource({key: [] for key in ("x", "y", "error", "name", "label", "off")})
         self._mu = LinearColorMapper(palette=list(LIGHT.links), low=0.0, high=1.0)
         self._error = LinearColorMapper(palette=list(LIGHT.links), low=0.0, high=1.0, nan_color="#999999")
         arcs = self.figure.multi_line(
@@ -179,7 +182,7 @@ class NetworkChart:
         )  # fmt: skip
         self._dots = dots
         self._text = self.figure.text(
-            "x", "y", "label", source=self.agents, text_font_size="13px", x_offset=13, y_offset=-9,
+            "x", "y", "label", source=self.agents, text_font_size="13px", text_align="center", y_offset="off",
             text_outline_width=0,
         )  # fmt: skip
         self.figure.add_tools(TapTool(renderers=[arcs, dots]))
@@ -204,10 +207,11 @@ class NetworkChart:
             "xs": [float(at[0]) for at, _ in tips], "ys": [float(at[1]) for at, _ in tips], "mu": µ,
             "width": [float(np.arctan2(way[1], way[0]) - np.pi / 2) for _, way in tips], "name": names,
         }  # fmt: skip
-        errors = picture.errors
+        errors, middle = picture.errors, float(picture.places[:, 1].mean())
         self.agents.data = {
             "x": picture.places[:, 0].tolist(), "y": picture.places[:, 1].tolist(), "error": errors.tolist(),
             "name": list(picture.names),
+            "off": [-14 if y >= middle else 28 for y in picture.places[:, 1]],
             "label": [n if np.isnan(e) else f"{n}: {e:.4g}" for n, e in zip(picture.names, errors, strict=True)],
         }  # fmt: skip
         if np.isfinite(errors).any():

@@ -19,11 +19,9 @@ import numpy as np
 from bokeh.events import ConnectionLost, DocumentReady
 from bokeh.layouts import column, row
 from bokeh.models import (
-    AutocompleteInput,
     Button,
     Checkbox,
     CheckboxGroup,
-    ColumnDataSource,
     CustomJS,
     Div,
     FileInput,
@@ -38,7 +36,7 @@ from bokeh.models import (
 from stochfuse.errors import StochfuseError, UsageError
 from stochfuse.explore import answers, state
 from stochfuse.explore.answers import Curve, Line, Told, Work
-from stochfuse.explore.charts import DARK, LIGHT, Chart, NetworkChart, lines_of
+from stochfuse.explore.charts import DARK, LIGHT, Chart, NetworkChart, key_of, lines_of
 from stochfuse.explore.network import Picture
 from stochfuse.explore.state import Asked, Given, field_of
 from stochfuse.scenario.registry import ESTIMATORS, LFG, SIMPLIFIED
@@ -64,15 +62,15 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums; } td, th 
 pre { white-space: pre-wrap; overflow-wrap: anywhere; background: var(--box); padding: 8px; margin: 0; max-height: 18rem;
   overflow: auto; font-size: 12.5px; } ul { margin: 4px 0; padding-left: 1.2em; }
 """
-SAVE = """const [n, text] = [source.data.name[0], source.data.text[0]]; if (!n) return;
+SAVE = """const [n, text] = cb_obj.tags; if (!n) return;
 const a = document.createElement("a"); a.href = URL.createObjectURL(new Blob([text])); a.download = n; a.click();
 setTimeout(() => URL.revokeObjectURL(a.href), 10000);"""
-READY = """dark.active = matchMedia("(prefers-color-scheme: dark)").matches;
+READY = """setTimeout(() => { dark.active = matchMedia("(prefers-color-scheme: dark)").matches; }, 50);
 const all = (n, f) => { for (const e of n.querySelectorAll("*")) { f(e); if (e.shadowRoot) all(e.shadowRoot, f); } };
 setTimeout(() => all(document, e => { if (e.classList.contains("noUi-handle")) {
   const group = e.closest(".bk-input-group"); e.setAttribute("aria-label", group.innerText.split(":")[0]); } }), 300);
 window.addEventListener("input", e => { const f = e.composedPath()[0]; if (f.type === "file" && f.files.length
-  && f.files[0].size > most) { f.value = ""; said.text = `<span class="wrong">a file of at most ${most} bytes is expected</span>`; } },
+  && f.files[0].size > most) { f.value = ""; said.visible = true; said.text = `<span class="wrong">a file of at most ${most} bytes is expected</span>`; } },
   true);"""
 
 
@@ -98,6 +96,7 @@ class Page:
         self._touched = False
         self._work, self._work_least = Work(self._hand_on), Work(self._hand_on, (answers.least,))
         self._build()
+        self._dress()
         self.asked = self._begin(given)
         doc.title = "stochfuse explore"
         doc.template = (Path(__file__).parent / "page.html").read_text(encoding="utf-8")
@@ -122,7 +121,7 @@ class Page:
             "p0": TextInput(title="First estimates P", placeholder="as in the scenario"),
             "estimators": CheckboxGroup(labels=list(ESTIMATORS), active=[]),
             "quantities": Select(title="Quantity", options=list(QUANTITIES), value=QUANTITIES[0]),
-            "metric": AutocompleteInput(title="Metric", restrict=False, min_characters=0, placeholder="trace"),
+            "metric": TextInput(title="Metric"),
             "agent": Select(title="Whose", options=["mean", "worst", "best"], value="mean"),
             "target": TextInput(title="Target to be met"),
         }  # fmt: skip
@@ -130,13 +129,13 @@ class Page:
         children: list[Any] = []
         for name, widget in f.items():
             widget.stylesheets, widget.sizing_mode, widget.margin = [self._sheet], "stretch_width", (3, 0, 3, 0)
-            self._errors[name] = self._div("", {"role": "alert"})
+            self._errors[name] = self._div("", {"role": "alert"}, visible=False, margin=0)
             if name == "estimators":
                 children.append(self._div("Estimators"))
                 widget.html_attributes = {"role": "group", "aria-label": "Estimators"}
             children += [widget, self._errors[name]]
             attribute = "active" if name == "estimators" else "value"
-            follow = {"file": self._open, "scenario": self._pick, "target": self._retarget}.get(name, self._change)
+            follow = {"file": self._soon, "scenario": self._pick, "target": self._retarget}.get(name, self._change)
             self._on(widget, attribute, lambda _new, follow=follow: follow())
         self._status = self._div("", {"role": "status", "aria-live": "polite"}, name="status")
         self._dark = Checkbox(label="dark", active=False, name="dark", stylesheets=[self._sheet])
@@ -178,6 +177,7 @@ class Page:
         self._target = self._over.span("width", True)
         self._on(self._target, "location", self._dragged)
         self._said_least, self._said_load = self._div(""), self._div("")
+        self._keys = [self._div(""), self._div(""), self._div("")]
         self._about = self._div("Click on a link or an agent.", {"role": "status", "aria-live": "polite"})
         self._which = Select(title="Link or agent", options=[""], value="", stylesheets=[self._sheet])
         self._on(self._which, "value", self._point)
@@ -189,25 +189,31 @@ class Page:
             self._on(source.selected, "indices", lambda new, many=many: self._clicked(many, new))
         wide: Any = {"sizing_mode": "stretch_width"}
         self._figure_roots = [
-            column(self._over.figure, self._said_least, name="over", **wide),
-            column(self._steps.figure, name="steps", **wide),
+            column(self._over.figure, self._keys[0], self._said_least, name="over", **wide),
+            column(self._steps.figure, self._keys[1], name="steps", **wide),
             column(self._network.figure, row(self._which, self._one, **wide), self._about, name="network", **wide),
-            column(self._load.figure, self._said_load, name="load", **wide),
+            column(self._load.figure, self._keys[2], self._said_load, name="load", **wide),
         ]
 
     def _build_this(self) -> Any:
         self._kind = RadioButtonGroup(labels=["Command", "Python", "File"], active=0, stylesheets=[self._sheet])
         self._on(self._kind, "active", lambda _: self._show_this())
         self._this = self._div("")
-        self._saved = ColumnDataSource({"name": [""], "text": [""]})
-        self._saved.js_on_change("data", CustomJS(args={"source": self._saved}, code=SAVE))
+        self._saved = Div(visible=False)
+        self._saved.js_on_change("tags", CustomJS(code=SAVE))
         buttons = []
         for kind in ("CSV", "Scenario", "Figure", "Report"):
             button = Button(label=f"Save {kind.lower() if kind != 'CSV' else kind}", stylesheets=[self._sheet])
             button.on_click(lambda _e, kind=kind: self._export(kind))
             buttons.append(button)
         wide: Any = {"sizing_mode": "stretch_width"}
-        return column(row(self._kind, *buttons, **wide), self._this, name="this", **wide)
+        return column(
+            row(self._kind, *buttons, styles={"flex-wrap": "wrap"}, **wide),
+            self._this,
+            self._saved,
+            name="this",
+            **wide,
+        )
 
     # what is asked
 
@@ -227,9 +233,7 @@ class Page:
         for name in ("q", "r", "p0", "target", "metric"):
             f[name].value = ""
         f["estimators"].active = [ESTIMATORS.index(scenario.estimator or LFG)]
-        states = scenario.model.states
-        f["metric"].completions = ["trace", "det", "max-eig", *(f"{m}:{s}" for m in ("var", "std") for s in states)]
-        f["metric"].placeholder = scenario.metric or "trace"
+        f["metric"].placeholder = f"{scenario.metric or 'trace'}; or std:{scenario.model.states[0]}, …"
         f["agent"].value = str(scenario.agent or "mean")
         self._base = scenario
         self._quiet = False
@@ -277,6 +281,10 @@ class Page:
         given = self._presets.get(name) or state.preset(name)
         self.asked = self._begin(given)
         self._change()
+
+    def _soon(self) -> None:
+        """Open a file when its name, which comes behind its content, is there too."""
+        self._doc.add_next_tick_callback(self._open)
 
     def _open(self) -> None:
         """Take the file that was opened: its content, under its name."""
@@ -372,7 +380,7 @@ class Page:
         """Mark the fields that are wrong, and no others."""
         for name, div in self._errors.items():
             text = messages.get(name, "")
-            div.text = f'<span class="wrong">{_lines(text)}</span>' if text else ""
+            div.text, div.visible = f'<span class="wrong">{_lines(text)}</span>' if text else "", bool(text)
             widget = self._fields[name]
             widget.css_classes = ["wrong"] if text else []
 
@@ -388,6 +396,7 @@ class Page:
             return
         if isinstance(found, Exception):
             self._refused[name] = str(found) or type(found).__name__
+            self._show_about()
         if name == "progress":
             self._status.text = f"quick answers are here; exact ones are coming: {escape(str(found))}"
         elif name == "done":
@@ -426,6 +435,7 @@ class Page:
         unit = f" [{asked.measure.unit}]" if asked.measure.unit and "[" not in y else ""
         self._over.show(lines_of(curves, look, "over"), KINDS[asked.kind], y + unit)
         self._steps.show(lines_of(curves, look, "steps"), "step k", y + unit)
+        self._keys[0].text = self._keys[1].text = key_of(lines_of(curves, look, "over"))
         at = {"link": asked.link, "power": asked.transmit_power}.get(asked.kind)
         self._at.location, self._at.visible = at, at is not None
         for chart in (self._over, self._steps):
@@ -440,7 +450,7 @@ class Page:
             for name, color, dash, y in zip(names, colors, ("solid", "dashed"), found.value, strict=True)
         ]
         self._load.show(lines, "step k", "new nodes per agent")
-        self._load.figure.styles = {"opacity": "1"}
+        self._keys[2].text, self._load.figure.styles = key_of(lines), {"opacity": "1"}
         self._said_load.text = escape(found.text)
 
     def _show_least(self, found: Any) -> None:
@@ -515,7 +525,7 @@ class Page:
         last, view = asked.scenario.network.steps, curves[0].views[-1] if curves else None
         rows = "".join(
             f"<tr><td>{escape(c.name)}</td><td>{escape(c.quantity)}</td><td class='n'>{_value(c.steps)}</td>"
-            f"<td class='soft'>{escape(c.how)}</td></tr>"
+            f"<td class='soft'>{escape(c.how.replace('; ± one standard error', ''))}</td></tr>"
             for c in curves
         )
         what = "" if view is None else f"{view.what.partition(': ')[2]}; {view.whom}"
@@ -527,7 +537,7 @@ class Page:
         ]
         listed = "".join(f"<li>{_lines(text)}</li>" for text in (*refused, *notes))
         self._numbers.text = (
-            f"<div><b>{escape(what)}</b>, step {last}{at}</div><table><tr><th>by</th><th>quantity</th><th>value</th>"
+            f"<div><b>{escape(what)}</b>, step {last}{at}</div><table><tr><th>by</th><th>quantity</th><th>value [95 %]</th>"
             f"<th>how exact</th></tr>{rows}</table>" + (f"<ul class='soft'>{listed}</ul>" if listed else "")
         )
 
@@ -564,7 +574,8 @@ class Page:
         self._doc.add_next_tick_callback(lambda: self._save(name, text))
 
     def _save(self, name: str, text: str) -> None:
-        self._saved.data = {"name": [name], "text": [text]}
+        self._saved.tags = []
+        self._saved.tags = [name, text]
         self._status.text = f"saved {escape(name)}"
 
     # looks
