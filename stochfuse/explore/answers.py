@@ -12,6 +12,7 @@ import io
 import shlex
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from time import monotonic
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,6 +36,8 @@ from stochfuse.scenario.registry import GENERAL, MONTE_CARLO, OPTIMAL, SIMPLIFIE
 from stochfuse.scenario.scenario import Scenario
 
 LEVEL = 0.95
+EVERY = 0.4
+"""Seconds between what is said of how far it is."""
 AT_ONCE = threading.Semaphore(2)
 """Exact engines at work at a time, of all pages together."""
 
@@ -276,12 +279,16 @@ class Superseded(Exception):  # noqa: N818
 
 class _Listener(Progress):
     def __init__(self, work: Work, number: int, name: str) -> None:
-        self._work, self._number, self._name = work, number, name
+        self._work, self._number, self._name, self._said = work, number, name, monotonic()
 
     def advance(self, what: str, done: int, total: int) -> None:
-        """Hand on how far it is; what is no longer asked ends here."""
-        share = f", {done:,} of {total:,}" if total else ""
-        self._work.say(self._number, "progress", f"{self._name}: {what}{share}")
+        """Hand on now and then how far it is; what is no longer asked ends here."""
+        if self._number != self._work.number:
+            raise Superseded
+        if monotonic() - self._said > EVERY:
+            self._said = monotonic()
+            share = f", {done:,} of {total:,}" if total else ""
+            self._work.say(self._number, "progress", f"{self._name}: {what}{share}")
 
 
 def records(curves: Sequence[Curve]) -> str:

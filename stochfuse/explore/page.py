@@ -94,14 +94,16 @@ class Page:
         self._pointed: Any = None
         self._changed: dict[tuple[int, int], float] = {}
         self._touched = False
-        self._work, self._work_least = Work(self._hand_on), Work(self._hand_on, (answers.least,))
+        self._work = Work(lambda *said: self._hand_on(self._work, *said))
+        self._work_least = Work(lambda *said: self._hand_on(self._work_least, *said), (answers.least,))
         self._build()
         self._dress()
         self.asked = self._begin(given)
         doc.title = "stochfuse explore"
         doc.template = (Path(__file__).parent / "page.html").read_text(encoding="utf-8")
         doc.on_session_destroyed(lambda _: self._work.stop())
-        self._ask()
+        # not before the page is there: its own files have to be sent first
+        doc.on_event(DocumentReady, lambda _: self._ask())
 
     # fields
 
@@ -386,9 +388,8 @@ class Page:
 
     # answers
 
-    def _hand_on(self, number: int, name: str, found: Any) -> None:
+    def _hand_on(self, work: Work, number: int, name: str, found: Any) -> None:
         """Bring an answer from its thread to the document."""
-        work = self._work_least if name == "least" else self._work
         self._doc.add_next_tick_callback(lambda: self._answered(work, number, name, found))
 
     def _answered(self, work: Work, number: int, name: str, found: Any) -> None:

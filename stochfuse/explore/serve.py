@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import socket
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -54,6 +55,7 @@ def serve(given: Given, port: int | None, address: str, started: Callable[[str],
         check_unused_sessions_milliseconds=5_000,
         unused_session_lifetime_milliseconds=30_000,
     )
+    sys.setswitchinterval(0.001)  # so that a page is answered while engines work beside it
     server.start()
     started(f"http://{address}:{chosen}/")
     try:
