@@ -230,7 +230,7 @@ class Work:
     def ask(self, asked: Asked) -> int:
         """Begin with a question, and give up the one before."""
         self.number += 1
-        threading.Thread(target=self._follow, args=(self.number, asked), daemon=True).start()
+        threading.Thread(target=self._follow, args=(self.number, asked), name="stochfuse-page", daemon=True).start()
         return self.number
 
     def stop(self) -> None:

@@ -80,7 +80,7 @@ def _free(address: str, port: int | None) -> int:
             except OSError as error:
                 if port is not None:
                     reason = error.strerror or error
-                    raise UsageError(f"--port: expected one that is free, got {port} ({reason}); see --port") from None
+                    raise UsageError(f"--port: expected one that is free, got {port} ({reason})") from None
                 continue
             return one
     last = FIRST_PORT + PORTS - 1
