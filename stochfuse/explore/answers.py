@@ -1,8 +1,8 @@
 """What is answered: the quick engines first, the exact ones behind them, and nothing of what was asked before.
 
-Answers are the command line's: `predict`, `compare`, `solve --target`, `solve --sensitivity` and `messages`, read by the
-views that print its tables.  `Work` follows one question at a time in a thread of its own; when the next is asked, the
-one before ends at its next sign of life (`stochfuse.engines.progress`), and what it still says is dropped.
+Answers are the command line's: `predict`, `compare`, `solve --target`, `solve --sensitivity` and `messages`, read by
+the views that print its tables.  `Work` follows one question at a time in a thread of its own; when the next is asked,
+the one before ends at its next sign of life (`stochfuse.engines.progress`), and what it still says is dropped.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from stochfuse.questions.messages import RULES, message_load
 from stochfuse.questions.sensitivity import sensitivity
 from stochfuse.report import document
 from stochfuse.report.comparisons import EstimatorView, estimator_report
+from stochfuse.report.plot import figure_class
 from stochfuse.report.predictions import WIDTH_95, PredictionView, predict_csv
 from stochfuse.report.predictions import report as predictions_report
-from stochfuse.report.plot import figure_class
 from stochfuse.report.table import Report, to_csv
 from stochfuse.scenario.registry import GENERAL, MONTE_CARLO, OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.scenario import Scenario
@@ -205,7 +205,7 @@ def _with_sensitivity(asked: Asked) -> Picture:
 
 def _load(asked: Asked) -> Told:
     """Mean nodes that the messages of a step bring an agent, of both rules at every step."""
-    link = [asked.link] if asked.kind == "link" else None
+    link = [asked.link] if asked.kind == "link" and asked.link is not None else None
     agent = asked.agent if isinstance(asked.agent, int) else "mean"
     loads = [message_load(asked.scenario, link, rule) for rule in RULES]
     by_step = np.array([[load.between(k, k).mean(agent)[0] for k in load.steps] for load in loads])

@@ -1,6 +1,6 @@
 """The page's figures: curves with bands, and the network; each drawn anew from data, in light or dark.
 
-Curves are told apart by colour (Okabe and Ito's) and by dashes; words in a figure are plain text, whatever they contain.
+Curves are told apart by colour (Okabe and Ito's) and by dashes; words in a figure are plain text, whatever they are.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from bokeh.models import (
     HoverTool,
     LinearColorMapper,
     PlainText,
+    Range1d,
     Span,
     TapTool,
 )
@@ -100,7 +101,7 @@ class Chart:
         ends = [f"{name} from {line.y[0]:.4g} to {line.y[-1]:.4g}" for name, *_, line in lines]
         self.figure.html_attributes = {"role": "img", "aria-label": f"{self._label}, {x}: {'; '.join(ends)}"}
 
-    def span(self, dimension: str, editable: bool) -> Span:
+    def span(self, dimension: Any, editable: bool) -> Span:
         """Return a line across the figure, which may be dragged."""
         line = Span(
             location=None, dimension=dimension, editable=editable, line_width=2.5 if editable else 1.5, visible=False,
@@ -134,8 +135,8 @@ STROKES = {"solid": "", "dashed": "6", "dotted": "2 3", "dotdash": "2 3 6 3"}
 def key_of(lines: Sequence[tuple[str, str, str, Line]]) -> str:
     """Return which line is whose, as HTML that flows."""
     return "".join(
-        f'<span style="white-space: nowrap; margin-right: 14px"><svg width="30" height="10" aria-hidden="true"><line x1="0" '
-        f'x2="28" y1="6" y2="6" stroke="{color}" stroke-width="2.5" stroke-dasharray="{STROKES[dash]}"/></svg> '
+        '<span style="white-space: nowrap; margin-right: 14px"><svg width="30" height="10" aria-hidden="true"><line '
+        f'x1="0" x2="28" y1="6" y2="6" stroke="{color}" stroke-width="2.5" stroke-dasharray="{STROKES[dash]}"/></svg> '
         f"{escape(name)}</span> "
         for name, color, dash, _ in lines
     )
@@ -160,7 +161,8 @@ class NetworkChart:
     def __init__(self) -> None:
         self.figure: Any = figure(
             height=360, sizing_mode="stretch_width", tools="pan,wheel_zoom,reset,save", toolbar_location="above",
-            html_attributes={"role": "img", "aria-label": "Network"}, min_width=200, x_range=(-1.5, 1.5), y_range=(-1.5, 1.5),
+            html_attributes={"role": "img", "aria-label": "Network"}, min_width=200,
+            x_range=Range1d(start=-1.5, end=1.5), y_range=Range1d(start=-1.5, end=1.5),
         )  # fmt: skip
         self.figure.toolbar.logo = None
         keys = ("xs", "ys", "mu", "width", "name")

@@ -113,8 +113,9 @@ def picture(asked: Asked) -> Picture:
     """
     scenario, n = asked.scenario, asked.scenario.network.agents
     step = None
-    if asked.kind == "link":
-        link = np.where(reachable(scenario.network), asked.link, np.nan)
+    alike = asked.link if asked.kind == "link" else None
+    if alike is not None:
+        link = np.where(reachable(scenario.network), alike, np.nan)
     else:
         known = links_of_scenario(scenario).link
         link = np.where(reachable(scenario.network), known, np.nan)
@@ -128,7 +129,7 @@ def picture(asked: Asked) -> Picture:
         angle = 2 * np.pi * np.arange(n) / n
         places = np.stack([np.sin(angle), np.cos(angle)], axis=1)
     try:
-        found = predict(scenario, [asked.link] if asked.kind == "link" else None, SIMPLIFIED)
+        found = predict(scenario, None if alike is None else [alike], SIMPLIFIED)
         errors = np.array([found.values(asked.measure, i + 1)[0, -1] for i in range(n)])
     except StochfuseError:  # which the curves say
         errors = np.full(n, np.nan)

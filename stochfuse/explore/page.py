@@ -1,7 +1,7 @@
 """One window of the page: fields on the left, numbers and figures on the right, and what happens between them.
 
-A change marks everything as not yet answered at once; what is answered afterwards is shown only if nothing else has been
-asked since.  All that comes from files or fields is escaped where it meets HTML.
+A change marks everything as not yet answered at once; what is answered afterwards is shown only if nothing else has
+been asked since.  All that comes from files or fields is escaped where it meets HTML.
 """
 
 from __future__ import annotations
@@ -47,31 +47,7 @@ WAIT = 30
 OWN, ALIKE = "the scenario's own", "all alike, µ below"
 QUANTITIES = ("claimed,actual", "claimed", "actual", "consistency", "bias", "rms")
 KINDS = {"link": "link probability µ of all links", "own": "µ of all links, if alike", "power": "radio power [dBm]"}
-SHEET = """
-:host { --label: var(--ink); color: var(--ink); font-size: 14px; }
-label, .bk-slider-title, legend { color: var(--ink) !important; font-size: 13px; }
-.bk-input, .bk-btn, select, textarea { background-color: var(--field) !important; color: var(--ink) !important;
-  border-color: var(--line) !important; }
-.bk-btn.bk-active { background-color: var(--mark) !important; color: var(--bg) !important; }
-.bk-input:focus, .bk-btn:focus, .noUi-handle:focus, input:focus-visible, summary:focus { outline: 2px solid var(--mark);
-  outline-offset: 1px; }
-:host(.wrong) .bk-input { border: 2px solid var(--wrong) !important; }
-.noUi-connect, .noUi-target { background: var(--line); }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; } td, th { padding: 1px 12px 1px 0;
-  text-align: left; } td.n { text-align: right; } .soft { color: var(--soft); } .wrong { color: var(--wrong); }
-pre { white-space: pre-wrap; overflow-wrap: anywhere; background: var(--box); padding: 8px; margin: 0; max-height: 18rem;
-  overflow: auto; font-size: 12.5px; } ul { margin: 4px 0; padding-left: 1.2em; }
-"""
-SAVE = """const [n, text] = cb_obj.tags; if (!n) return;
-const a = document.createElement("a"); a.href = URL.createObjectURL(new Blob([text])); a.download = n; a.click();
-setTimeout(() => URL.revokeObjectURL(a.href), 10000);"""
-READY = """setTimeout(() => { dark.active = matchMedia("(prefers-color-scheme: dark)").matches; }, 50);
-const all = (n, f) => { for (const e of n.querySelectorAll("*")) { f(e); if (e.shadowRoot) all(e.shadowRoot, f); } };
-setTimeout(() => all(document, e => { if (e.classList.contains("noUi-handle")) {
-  const group = e.closest(".bk-input-group"); e.setAttribute("aria-label", group.innerText.split(":")[0]); } }), 300);
-window.addEventListener("input", e => { const f = e.composedPath()[0]; if (f.type === "file" && f.files.length
-  && f.files[0].size > most) { f.value = ""; said.visible = true; said.text = `<span class="wrong">a file of at most ${most} bytes is expected</span>`; } },
-  true);"""
+HERE = Path(__file__).parent
 
 
 class Page:
@@ -86,7 +62,7 @@ class Page:
     def __init__(self, doc: Any, given: Given) -> None:
         self._doc, self._begun, self._logs = doc, given, {}
         self._presets: dict[str, Given] = {given.name: given}
-        self._sheet = InlineStyleSheet(css=SHEET)
+        self._sheet = InlineStyleSheet(css=(HERE / "fields.css").read_text(encoding="utf-8"))
         self._quiet = self._waiting = False
         self._curves: dict[str, list[Curve]] = {}
         self._refused: dict[str, str] = {}
@@ -100,7 +76,7 @@ class Page:
         self._dress()
         self.asked = self._begin(given)
         doc.title = "stochfuse explore"
-        doc.template = (Path(__file__).parent / "page.html").read_text(encoding="utf-8")
+        doc.template = (HERE / "page.html").read_text(encoding="utf-8")
         doc.on_session_destroyed(lambda _: self._work.stop())
         # not before the page is there: its own files have to be sent first
         doc.on_event(DocumentReady, lambda _: self._ask())
@@ -111,7 +87,7 @@ class Page:
         """Make all fields and figures."""
         f: dict[str, Any] = {
             "scenario": Select(title="Scenario", options=[*dict.fromkeys([self._begun.name, *preset_names()])]),
-            "file": FileInput(title="Open a scenario or packet log", accept=",".join((*state.SCENARIO_SUFFIXES, *state.LOG_SUFFIXES))),
+            "file": FileInput(title="Open a scenario or packet log", accept=",".join(state.SUFFIXES)),
             "links": Select(title="Links", options=[OWN, ALIKE]),
             "link": Slider(title="Link probability µ", start=0, end=1, step=0.01, value=0.5),
             "power": TextInput(title="Radio power [dBm]"),
@@ -142,8 +118,7 @@ class Page:
         self._status = self._div("", {"role": "status", "aria-live": "polite"}, name="status")
         self._dark = Checkbox(label="dark", active=False, name="dark", stylesheets=[self._sheet])
         self._on(self._dark, "active", lambda _: self._dress())
-        theme = CustomJS(code='document.documentElement.dataset.theme = cb_obj.active ? "dark" : "light";')
-        self._dark.js_on_change("active", theme)
+        self._dark.js_on_change("active", CustomJS(code="stochfuse.theme(cb_obj.active);"))
         self._numbers = self._div(
             "", {"role": "region", "aria-label": "Numbers", "aria-live": "polite"}, name="numbers"
         )
@@ -153,7 +128,8 @@ class Page:
             *self._figure_roots, self._build_this(),
         ):  # fmt: skip
             self._doc.add_root(root)
-        ready = CustomJS(args={"dark": self._dark, "said": self._errors["file"], "most": state.MOST_BYTES}, code=READY)
+        known = {"dark": self._dark, "said": self._errors["file"], "most": state.MOST_BYTES}
+        ready = CustomJS(args=known, code="stochfuse.ready(dark, said, most);")
         self._doc.js_on_event(DocumentReady, ready)
         self._doc.js_on_event(ConnectionLost, CustomJS(code='document.body.classList.add("lost");'))
 
@@ -202,7 +178,7 @@ class Page:
         self._on(self._kind, "active", lambda _: self._show_this())
         self._this = self._div("")
         self._saved = Div(visible=False)
-        self._saved.js_on_change("tags", CustomJS(code=SAVE))
+        self._saved.js_on_change("tags", CustomJS(code="stochfuse.save(...cb_obj.tags);"))
         buttons = []
         for kind in ("CSV", "Scenario", "Figure", "Report"):
             button = Button(label=f"Save {kind.lower() if kind != 'CSV' else kind}", stylesheets=[self._sheet])
@@ -538,8 +514,9 @@ class Page:
         ]
         listed = "".join(f"<li>{_lines(text)}</li>" for text in (*refused, *notes))
         self._numbers.text = (
-            f"<div><b>{escape(what)}</b>, step {last}{at}</div><table><tr><th>by</th><th>quantity</th><th>value [95 %]</th>"
-            f"<th>how exact</th></tr>{rows}</table>" + (f"<ul class='soft'>{listed}</ul>" if listed else "")
+            f"<div><b>{escape(what)}</b>, step {last}{at}</div><table><tr><th>by</th><th>quantity</th>"
+            f"<th>value [95 %]</th><th>how exact</th></tr>{rows}</table>"
+            + (f"<ul class='soft'>{listed}</ul>" if listed else "")
         )
 
     def _show_this(self) -> None:

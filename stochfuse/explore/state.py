@@ -47,6 +47,7 @@ REACH = 10.0
 FILE = "page.toml"
 """Name of the file that has everything that options cannot say."""
 SCENARIO_SUFFIXES, LOG_SUFFIXES = (".toml", ".json"), (".csv", ".txt", ".tsv")
+SUFFIXES = (*SCENARIO_SUFFIXES, *LOG_SUFFIXES)
 
 
 class Given(NamedTuple):
@@ -109,7 +110,7 @@ def opened(name: str, content: bytes, logs: Mapping[str, bytes]) -> Mapping[str,
         logged(name, {**logs, name: content})
         return None
     if suffix not in SCENARIO_SUFFIXES:
-        expected = ", ".join((*SCENARIO_SUFFIXES, *LOG_SUFFIXES))
+        expected = ", ".join(SUFFIXES)
         raise UsageError(f"{name}: expected a scenario or a packet log, by a name that ends in {expected}")
     try:
         text = content.decode("utf-8")
@@ -254,7 +255,7 @@ class Asked:
 
     @property
     def kind(self) -> str:
-        """What the curves run over: "link" (all alike), "power" (of the radios), or "own" (beside links of their own)."""
+        """What curves run over: "link" (all alike), "power" (of the radios), or "own" (beside links of their own)."""
         network = self.scenario.network
         if network.radio is not None:
             return "power"
@@ -385,9 +386,9 @@ def links_of(text: str) -> list[float]:
 FIELDS = {
     "network.agents": "agents", "network.steps": "steps", "network.architecture": "architecture", "model.Q": "q",
     "model.noise": "q", "model.R": "r", "model.sensor": "r", "initial.P": "p0", "network.radio": "power",
-    "network.link": "link", "network.case": "link", "agents": "agents", "steps": "steps", "q": "q", "r": "r", "p0": "p0",
-    "link": "link", "metric": "metric", "agent": "agent", "target": "target", "estimator": "estimators", "quantity":
-    "quantities",
+    "network.link": "link", "network.case": "link", "agents": "agents", "steps": "steps", "q": "q", "r": "r",
+    "p0": "p0", "link": "link", "metric": "metric", "agent": "agent", "target": "target", "estimator": "estimators",
+    "quantity": "quantities",
 }  # fmt: skip
 """Fields of the page that keys of a scenario, and first words of messages, are about."""
 
