@@ -58,6 +58,10 @@ def colour(name: str, look: Look) -> str:
     return look.curves[place % len(look.curves)]
 
 
+NOTHING = {"xs": [[0, 1]], "ys": [[0, 1]], "name": [""], "color": ["transparent"], "dash": ["solid"]}
+"""Axes need something to go by."""
+
+
 class Chart:
     """Curves along an axis, with bands.
 
@@ -74,7 +78,7 @@ class Chart:
         )  # fmt: skip
         self.figure.toolbar.logo = None
         self._label = label
-        self._lines = ColumnDataSource({key: [] for key in ("xs", "ys", "name", "color", "dash")})
+        self._lines = ColumnDataSource(NOTHING)
         self._bands = ColumnDataSource({"xs": [], "ys": [], "color": []})
         self.figure.patches("xs", "ys", source=self._bands, fill_color="color", fill_alpha=0.18, line_color=None)
         drawn = self.figure.multi_line(
@@ -84,13 +88,17 @@ class Chart:
 
     def show(self, lines: Sequence[tuple[str, str, str, Line]], x: str, y: str) -> None:
         """Draw lines (name, colour, dash, line) with the labels of the axes."""
-        self._lines.data = {
-            "xs": [line.x.tolist() for *_, line in lines],
-            "ys": [line.y.tolist() for *_, line in lines],
-            "name": [name for name, *_ in lines],
-            "color": [color for _, color, *_ in lines],
-            "dash": [dash for _, _, dash, _ in lines],
-        }
+        self._lines.data = (
+            NOTHING
+            if not lines
+            else {
+                "xs": [line.x.tolist() for *_, line in lines],
+                "ys": [line.y.tolist() for *_, line in lines],
+                "name": [name for name, *_ in lines],
+                "color": [color for _, color, *_ in lines],
+                "dash": [dash for _, _, dash, _ in lines],
+            }
+        )
         bands = [(color, line) for _, color, _, line in lines if line.low is not None and line.high is not None]
         self._bands.data = {
             "xs": [[*line.x, *line.x[::-1]] for _, line in bands],
@@ -185,7 +193,7 @@ class NetworkChart:
         self._dots = dots
         self._text = self.figure.text(
             "x", "y", "label", source=self.agents, text_font_size="13px", text_align="center", y_offset="off",
-            text_outline_width=0,
+            text_outline_width=3,
         )  # fmt: skip
         self.figure.add_tools(TapTool(renderers=[arcs, dots]))
         self.figure.add_tools(HoverTool(renderers=[arcs], tooltips=[("link", "@name"), ("µ", "@mu{0.000}")]))
@@ -235,5 +243,6 @@ class NetworkChart:
         dress(self.figure, look)
         self._mu.palette, self._error.palette = list(look.links), list(look.links)
         self._dots.glyph.line_color = self._text.glyph.text_color = look.ink
+        self._text.glyph.text_outline_color = look.back
         self._bar.background_fill_color = look.back
         self._bar.major_label_text_color = self._bar.title_text_color = look.ink

@@ -297,7 +297,9 @@ class Asked:
         found = []
         for alone in (False, True) if self.kind == "own" else (False,):
             for method in ("simplified", "optimal"):
-                found.append(["predict", *base, *self._along(FINE, alone), "--method", method, *shown])
+                counted = alone and method == "simplified" and self.scenario.network.counts is not None
+                more = ["--interval", "95%"] if counted else []
+                found.append(["predict", *base, *self._along(FINE, alone), "--method", method, *more, *shown])
             for some, grid, more in (
                 ([e for e in self.estimators if e not in sampled], COARSE, []),
                 ([e for e in self.estimators if e in sampled], ROUGH, ["--runs", str(RUNS)]),

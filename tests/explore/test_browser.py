@@ -223,8 +223,8 @@ def test_a_scenario_and_a_packet_log_are_opened(window, tmp_path):
     assert window.page.get_by_role("region", name="Numbers").get_by_text("<script>").is_visible()
     (tmp_path / "log.csv").write_text(LOG)
     window.field("Open a scenario or packet log").set_input_files(tmp_path / "log.csv")
-    message = window.page.get_by_text("network.agents")
-    message.wait_for()  # three agents with names are not the two nodes of the log
+    message = window.page.get_by_role("alert").get_by_text("network.link.file: expected links of network.nodes")
+    message.wait_for()  # names of agents that are no nodes of the log
     window.field("Scenario").select_option("thesis-steady")
     window.at("thesis-steady: 3 agents")
     window.field("Open a scenario or packet log").set_input_files([])

@@ -109,6 +109,7 @@ def test_compare_methods_and_estimators(tmp_path):
     assert "nothing removed" in text
 
 
+@pytest.mark.slow
 def test_crosscheck_that_disagrees_writes_the_page_all_the_same(tmp_path):
     run("crosscheck", "-", "--agents", "2", "--report", tmp_path / "c.html", input=MEANS, code=1)
     text = page_of(tmp_path / "c.html").text
@@ -117,6 +118,7 @@ def test_crosscheck_that_disagrees_writes_the_page_all_the_same(tmp_path):
     assert "“-” is standard input" in text
 
 
+@pytest.mark.slow
 def test_run_and_study(tmp_path):
     run("simulate", "--steps", "3", "--link", "0.5", "-o", tmp_path / "sim")
     run("run", "--steps", "3", "--link", "0.5", "--measurements", tmp_path / "sim" / "measurements.csv",
@@ -131,6 +133,7 @@ def test_run_and_study(tmp_path):
     assert "svg" in page.tags
 
 
+@pytest.mark.slow
 def test_expected_states(tmp_path):
     run("simulate", "--steps", "3", "--link", "0.5", "-o", tmp_path / "sim")
     run("predict", "--steps", "3", "--quantity", "state", "--measurements", tmp_path / "sim" / "measurements.csv",
