@@ -173,7 +173,7 @@ class NetworkChart:
             x_range=Range1d(start=-1.5, end=1.5), y_range=Range1d(start=-1.5, end=1.5),
         )  # fmt: skip
         self.figure.toolbar.logo = None
-        keys = ("xs", "ys", "mu", "width", "name")
+        keys = ("xs", "ys", "mu", "width", "name", "angle")
         self.links, self.heads = ColumnDataSource({k: [] for k in keys}), ColumnDataSource({k: [] for k in keys})
         self.agents = ColumnDataSource({key: [] for key in ("x", "y", "error", "name", "label", "off")})
         self._mu = LinearColorMapper(palette=list(LIGHT.links), low=0.0, high=1.0)
@@ -182,8 +182,8 @@ class NetworkChart:
             "xs", "ys", source=self.links, line_color={"field": "mu", "transform": self._mu}, line_width="width",
             nonselection_line_alpha=0.45, hover_line_alpha=1.0, line_cap="round",
         )  # fmt: skip
-        self.figure.scatter(
-            "xs", "ys", source=self.heads, marker="triangle", angle="width", size=9, line_color=None,
+        self._heads = self.figure.scatter(
+            "xs", "ys", source=self.heads, marker="triangle", angle="angle", size="width", line_width=0.7,
             fill_color={"field": "mu", "transform": self._mu},
         )  # fmt: skip
         dots = self.figure.scatter(
@@ -193,7 +193,7 @@ class NetworkChart:
         self._dots = dots
         self._text = self.figure.text(
             "x", "y", "label", source=self.agents, text_font_size="13px", text_align="center", y_offset="off",
-            text_outline_width=3,
+            background_fill_alpha=0.7, padding=1,
         )  # fmt: skip
         self.figure.add_tools(TapTool(renderers=[arcs, dots]))
         self.figure.add_tools(HoverTool(renderers=[arcs], tooltips=[("link", "@name"), ("µ", "@mu{0.000}")]))
@@ -210,12 +210,13 @@ class NetworkChart:
         µ = [float(picture.link[pair]) for pair in pairs]
         self.links.data = {
             "xs": [arc[:, 0].tolist() for arc in arcs], "ys": [arc[:, 1].tolist() for arc in arcs], "mu": µ,
-            "width": [picture.width(pair) for pair in pairs], "name": names,
+            "width": [picture.width(pair) for pair in pairs], "name": names, "angle": [0.0] * len(pairs),
         }  # fmt: skip
         tips = [(arc[-5], arc[-5] - arc[-7]) for arc in arcs]
         self.heads.data = {
             "xs": [float(at[0]) for at, _ in tips], "ys": [float(at[1]) for at, _ in tips], "mu": µ,
-            "width": [float(np.arctan2(way[1], way[0]) - np.pi / 2) for _, way in tips], "name": names,
+            "width": [picture.width(pair) + 7 for pair in pairs], "name": names,
+            "angle": [float(np.arctan2(way[1], way[0]) - np.pi / 2) for _, way in tips],
         }  # fmt: skip
         errors, middle = picture.errors, float(picture.places[:, 1].mean())
         self.agents.data = {
@@ -243,6 +244,6 @@ class NetworkChart:
         dress(self.figure, look)
         self._mu.palette, self._error.palette = list(look.links), list(look.links)
         self._dots.glyph.line_color = self._text.glyph.text_color = look.ink
-        self._text.glyph.text_outline_color = look.back
+        self._text.glyph.background_fill_color = self._heads.glyph.line_color = look.back
         self._bar.background_fill_color = look.back
         self._bar.major_label_text_color = self._bar.title_text_color = look.ink

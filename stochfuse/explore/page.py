@@ -67,6 +67,7 @@ class Page:
         self._curves: dict[str, list[Curve]] = {}
         self._refused: dict[str, str] = {}
         self._picture: Picture | None = None
+        self._loads: Told | None = None
         self._pointed: Any = None
         self._changed: dict[tuple[int, int], float] = {}
         self._touched = False
@@ -297,7 +298,7 @@ class Page:
     def _stale(self) -> None:
         self._work.stop()
         self._work_least.stop()
-        self._curves, self._refused, self._picture = {}, {}, None
+        self._curves, self._refused, self._picture, self._loads = {}, {}, None, None
         self._numbers.text = self._said_least.text = self._said_load.text = self._this.text = ""
         self._least.visible = False
         self._status.text = "working …"
@@ -391,7 +392,7 @@ class Page:
                 self._suggest(found[0])
             self._show_curves()
         self._show_numbers()
-        if name == SIMPLIFIED:
+        if isinstance(found, list):
             self._show_this()
 
     def _suggest(self, curve: Curve) -> None:
@@ -426,6 +427,7 @@ class Page:
             (name, color, dash, Line(np.asarray(x), y))
             for name, color, dash, y in zip(names, colors, ("solid", "dashed"), found.value, strict=True)
         ]
+        self._loads = found
         self._load.show(lines, "step k", "new nodes per agent")
         self._keys[2].text, self._load.figure.styles = key_of(lines), {"opacity": "1"}
         self._said_load.text = escape(found.text)
@@ -522,7 +524,11 @@ class Page:
     def _show_this(self) -> None:
         asked = self.asked
         drawn = [c.name for c in self._shown() if c.sampled]
-        makers: list[Callable[[], str]] = [lambda: "\n".join(asked.commands(drawn)), asked.python, asked.file]
+        makers: list[Callable[[], str]] = [
+            lambda: "\n".join(asked.commands(drawn)),
+            lambda: asked.python(drawn),
+            asked.file,
+        ]
         text = makers[self._kind.active or 0]()
         if self._kind.active != 2 and state.FILE in text:
             text = f"# {state.FILE} is what “File” shows\n{text}"
@@ -567,6 +573,8 @@ class Page:
             chart.dress(self._look)
         if self._curves:
             self._show_curves()
+        if self._loads is not None:
+            self._show_load(self._loads)
 
 
 def _number(field: str, text: str) -> float | None:

@@ -300,13 +300,15 @@ class Asked:
                 counted = alone and method == "simplified" and self.scenario.network.counts is not None
                 more = ["--interval", "95%"] if counted else []
                 found.append(["predict", *base, *self._along(FINE, alone), "--method", method, *more, *shown])
-            for some, grid, more in (
-                ([e for e in self.estimators if e not in sampled], COARSE, []),
-                ([e for e in self.estimators if e in sampled], ROUGH, ["--runs", str(RUNS)]),
-            ):
-                several = ["--estimator", ",".join(some), "--quantity", ",".join(self.quantities), *more]
-                found += (
-                    [["compare", *base, *self._along(grid, alone), *several, "--all-steps", *shown]] if some else []
+            for some, grid, runs in self._groups(sampled):
+                more = [
+                    "--quantity",
+                    ",".join(self.quantities),
+                    *(["--runs", str(runs)] if runs else []),
+                    "--all-steps",
+                ]
+                found.append(
+                    ["compare", *base, *self._along(grid, alone), "--estimator", ",".join(some), *more, *shown]
                 )
         at = ["--link", f"{self.link:.12g}"] if self.kind == "link" else []
         present = self._base(alone=not at)
@@ -315,6 +317,12 @@ class Asked:
             found.append(["solve", *self._base(alone=True), "--target", f"{self.target:.12g}", *shown])
         found.append(["messages", *present, *at])
         return [shlex.join(["stochfuse", *words]) for words in found]
+
+    def _groups(self, sampled: Sequence[str]) -> list[tuple[list[str], str, int]]:
+        """Estimators that are exact and those that are sampled, with their links and runs."""
+        found = [([e for e in self.estimators if e not in sampled], COARSE, 0)]
+        found.append(([e for e in self.estimators if e in sampled], ROUGH, RUNS))
+        return [group for group in found if group[0]]
 
     def _along(self, grid: str, alone: bool) -> list[str]:
         """Options that say what curves run over; `alone` what is at the scenario's own links."""
@@ -333,8 +341,8 @@ class Asked:
         words = [] if self.metric is None else ["--metric", self.metric]
         return words if self.agent == "mean" else [*words, "--agent", str(self.agent)]
 
-    def python(self) -> str:
-        """Return the same in Python."""
+    def python(self, sampled: Sequence[str] = ()) -> str:
+        """Return the same in Python; see `commands`."""
         words = [repr(self.given.name if self.plain() else FILE)]
         words += [f"{key}={value!r}" for key, value in self.options.items()] if self.plain() else []
         words += ["uniform_link=True"] if self.plain() and self.link is not None else []
@@ -353,9 +361,9 @@ class Asked:
                 for method in ("simplified", "optimal")
             ),
         ]  # fmt: skip
-        if self.estimators:
-            asks = f"estimators={list(self.estimators)}, quantities={list(self.quantities)}"
-            lines.append(f"p = sf.compare_estimators(s, {asks}, {at(COARSE)})")
+        for some, grid, runs in self._groups(sampled):
+            asks = f"estimators={some}, quantities={list(self.quantities)}{f', runs={runs}' if runs else ''}"
+            lines.append(f"p = sf.compare_estimators(s, {asks}, {at(grid)})")
             lines += [f"print(p.values({q!r}{', ' + of if of else ''})[..., -1])" for q in self.quantities]
         return "\n".join(lines) + "\n"
 
