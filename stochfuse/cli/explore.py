@@ -9,7 +9,7 @@ import typer
 from stochfuse.cli.options import OUTPUT, RARE, ScenarioArgument, option
 from stochfuse.cli.progress import quiet
 
-EXAMPLES = ("stochfuse explore", "stochfuse explore road-5 --port 5010 --no-browser")
+EXAMPLES = ("stochfuse explore my.toml", "stochfuse explore my.toml --port 5010 --no-browser")
 
 
 def explore(
