@@ -42,6 +42,10 @@ from stochfuse.explore.state import Asked, Given, field_of
 from stochfuse.scenario.registry import ESTIMATORS, LFG, SIMPLIFIED
 from stochfuse.scenario.scenario import preset_names
 
+PATIENCE = 30
+"""Seconds in which a file that is opened must be read."""
+MOST_LOGS = 8
+"""Files of links that are kept."""
 WAIT = 30
 """Milliseconds that pass before a change is followed, in which others may come."""
 OWN, ALIKE = "the scenario's own", "all alike, µ below"
@@ -64,6 +68,7 @@ class Page:
         self._presets: dict[str, Given] = {given.name: given}
         self._sheet = InlineStyleSheet(css=(HERE / "fields.css").read_text(encoding="utf-8"))
         self._quiet = self._waiting = False
+        self._opening = 0
         self._curves: dict[str, list[Curve]] = {}
         self._refused: dict[str, str] = {}
         self._picture: Picture | None = None
@@ -266,26 +271,44 @@ class Page:
         self._doc.add_next_tick_callback(self._open)
 
     def _open(self) -> None:
-        """Take the file that was opened: its content, under its name."""
+        """Take the file that was opened, its content under its name, in a thread and for so long only."""
         field = self._fields["file"]
         name, raw = PurePosixPath(str(field.filename).replace("\\", "/")).name, str(field.value)
         if not raw:
             return
-        try:
-            content = (
-                base64.b64decode(raw) if len(raw) <= state.MOST_BYTES * 4 // 3 + 4 else b" " * (state.MOST_BYTES + 1)
-            )
-            mapping = state.opened(name, content, self._logs)
-            if mapping is None:
-                self._logs[name] = content
-                given = state.with_log(self._given, name, self._logs)
-            else:
-                given = Given(name, mapping)
-            asked = self._begin(given)
-        except StochfuseError as error:
-            self._wrong({"file": str(error)})
+        self._wrong({})
+        self._status.text, self._opening = f"reading {escape(name)} …", self._opening + 1
+        number, given, logs = self._opening, self._given, dict([*self._logs.items()][-MOST_LOGS:])
+
+        def read() -> None:
+            try:
+                content = base64.b64decode(raw) if len(raw) <= 2 * state.MOST_BYTES else bytes(state.MOST_BYTES + 1)
+                mapping = state.opened(name, content, logs)
+                if mapping is None:
+                    logs[name] = content
+                found: Any = Given(name, mapping) if mapping is not None else state.with_log(given, name, logs)
+            except (StochfuseError, MemoryError) as error:
+                found = error
+            self._doc.add_next_tick_callback(lambda: self._opened(number, found, logs))
+
+        threading.Thread(target=read, daemon=True).start()
+        late = UsageError(f"{name}: expected a file that is read within {PATIENCE} s")
+        self._doc.add_timeout_callback(lambda: self._opened(number, late, self._logs), 1000 * PATIENCE)
+
+    def _opened(self, number: int, found: Any, logs: dict[str, bytes]) -> None:
+        """Begin with what was opened, unless it came too late."""
+        if number != self._opening:
             return
-        self._presets[given.name], self.asked = given, asked
+        self._opening += 1
+        try:
+            if isinstance(found, Exception):
+                raise found
+            self.asked = self._begin(found)
+        except (StochfuseError, MemoryError) as error:
+            self._wrong({"file": str(error) or type(error).__name__})
+            self._status.text = "see the marked field"
+            return
+        self._presets[found.name], self._logs = found, logs
         self._change()
 
     def _change(self) -> None:

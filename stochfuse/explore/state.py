@@ -35,7 +35,7 @@ from stochfuse.scenario.scenario import (
     with_links,
 )
 
-MOST_AGENTS, MOST_STEPS, MOST_BYTES = 60, 500, 4_000_000
+MOST_AGENTS, MOST_STEPS, MOST_BYTES = 60, 500, 2_000_000
 """What a page takes: agents, steps, and letters of a file that is opened."""
 FINE, COARSE, ROUGH = "0:1:0.05", "0:1:0.1", "0:1:0.25"
 """Link probabilities of the curves, as --link takes them: of the quick engines, the exact ones, and samples."""

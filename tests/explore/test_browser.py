@@ -245,7 +245,7 @@ def test_a_scenario_and_a_packet_log_are_opened(window, tmp_path):
         ("w.toml", "[model\n", "w.toml: not valid TOML"),
         ("w.exe", "x", "w.exe: expected a scenario or a packet log"),
         ("far.toml", '[network]\nagents = 3\nsteps = 2\nlink = { file = "/etc/passwd" }\n', "opened here before"),
-        ("big.toml", "#" * 4_000_001, "a file of at most 4000000 bytes"),
+        ("big.toml", "#" * 2_000_001, "a file of at most 2000000 bytes"),
     ],
 )
 def test_a_wrong_file_is_marked_at_its_field(window, tmp_path, name, content, message):
