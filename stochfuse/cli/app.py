@@ -12,7 +12,7 @@ from typer.core import TyperGroup
 
 from stochfuse import __version__
 from stochfuse.cli.help import Command
-from stochfuse.cli.options import gathered
+from stochfuse.cli.options import WORDS, gathered
 from stochfuse.cli.progress import shown
 from stochfuse.errors import NoAnswerError, ScenarioError, StochfuseError, UsageError, nearest
 
@@ -28,6 +28,7 @@ COMMANDS = (
     "crosscheck",
     "reproduce",
     "study",
+    "explore",
     "links",
     "scenario",
     "methods",
@@ -85,6 +86,7 @@ class Commands(TyperGroup):
         """Take --debug and --cite wherever they stand."""
         ctx.obj = "--debug" in args
         words = [word for word in args if word != "--debug"]
+        WORDS.set(tuple(words))
         if "--cite" in words:
             from stochfuse.report.citations import cited
 

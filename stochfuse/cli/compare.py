@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-import typer
-
 from stochfuse.cli.options import (
     RARE,
     SHOWN,
@@ -18,6 +16,7 @@ from stochfuse.cli.options import (
     MetricOption,
     OverOption,
     Precisely,
+    Reported,
     Sampling,
     ScenarioArgument,
     Weighing,
@@ -29,6 +28,7 @@ from stochfuse.cli.options import (
     quantity_names,
     settings_for,
     steps_at,
+    tell,
     whose,
 )
 from stochfuse.errors import UsageError
@@ -36,6 +36,7 @@ from stochfuse.scenario.registry import ESTIMATORS, GENERAL, INTERSECTIONS, METH
 
 if TYPE_CHECKING:
     from stochfuse.kalman.metrics import Metric
+    from stochfuse.report.table import Report
     from stochfuse.scenario.scenario import Scenario
 
 ALL = "all"
@@ -90,16 +91,18 @@ def compare(
     graphs: Graphs = Graphs(),
     weighing: Weighing = Weighing(),
     to: Written = Written(),
+    page: Reported = Reported(),
 ) -> None:
     """Show what methods predict side by side, and the signed differences; or what estimators claim and achieve.
 
-    simplified is approximate, general and naive are exact averages over every outcome (naive of a rule that counts
-    shared information twice), monte-carlo is sampled, with its standard error.
+    simplified is approximate, general and naive are exact (naive counts shared information twice), monte-carlo
+    is sampled, with its standard error.
     """
     from stochfuse.kalman.metrics import metric as metric_of
     from stochfuse.prediction.method import Shown
 
     to.check(scenario)
+    page.check(to.output, to.plot, scenario)
     given, links = changes.of(scenario)
     swept = changes.over(over, given)
     given = swept.longest if swept else given
@@ -132,7 +135,7 @@ def compare(
     chosen, chosen_agent = metric_of(metric or given.metric or "trace", given.model), whose(agent, given)
     steps = steps_at(at, given)
     settings["shown"] = Shown(tuple(quantities), (chosen,), chosen_agent, steps)
-    shown = _Shown(chosen, chosen_agent, steps, to)
+    shown = _Shown(chosen, chosen_agent, steps, to, page)
     if several:
         only = None if names == [ALL] else names
         _estimators(shown, given, links, only, None if methods is None else ways[0], quantities, all_steps, settings)
@@ -153,6 +156,12 @@ class _Shown(NamedTuple):
     agent: int | str
     steps: tuple[int, ...] | None
     to: Written
+    page: Reported
+
+    def write(self, report: Report, scenario: Scenario, said: Sequence[str]) -> None:
+        """Write the answer, and the page."""
+        self.to.write(report)
+        self.page.write(report, scenario.to_mapping(), said)
 
 
 def _methods(
@@ -175,10 +184,8 @@ def _methods(
     )
     view = comparisons.ComparisonView(found, views, relative)
     view.values()
-    for prediction in found.predictions:
-        for note in prediction.notes:
-            typer.echo(f"note: {prediction.method}: {note}", err=True)
-    how.to.write(comparisons.comparison_report(view))
+    said = tell(f"note: {prediction.method}: {note}" for prediction in found.predictions for note in prediction.notes)
+    how.write(comparisons.comparison_report(view), scenario, said)
 
 
 def _estimators(
@@ -199,16 +206,12 @@ def _estimators(
         check(name, how.metric)
     found = run(scenario, links, names, method, quantities=quantities, **settings)
     view = estimators.EstimatorView(found, how.metric, how.agent, how.to.digits, quantities, all_steps, how.steps)
-    for reason in found.left_out:
-        typer.echo(f"note: left out: {reason}", err=True)
-    for prediction in found.predictions:
-        for note in prediction.notes:
-            typer.echo(f"note: {prediction.estimator}: {note}", err=True)
+    said = [f"note: left out: {reason}" for reason in found.left_out]
+    said += [f"note: {prediction.estimator}: {note}" for prediction in found.predictions for note in prediction.notes]
     warnings = {views[0].prediction.estimator: views[0].overconfidence() for views in view.views}
     warnings = {name: warning for name, warning in warnings.items() if warning}
     if len(warnings) > 2:
-        typer.echo(f"warning: overconfident by more than 5 % somewhere: {', '.join(warnings)}", err=True)
+        said.append(f"warning: overconfident by more than 5 % somewhere: {', '.join(warnings)}")
     else:
-        for name, warning in warnings.items():
-            typer.echo(f"warning: {name}: {warning}", err=True)
-    how.to.write(estimators.estimator_report(view))
+        said += [f"warning: {name}: {warning}" for name, warning in warnings.items()]
+    how.write(estimators.estimator_report(view), scenario, tell(said))

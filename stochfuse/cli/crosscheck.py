@@ -14,6 +14,7 @@ from stochfuse.cli.options import (
     Graphs,
     MetricOption,
     Precisely,
+    Reported,
     Sampling,
     ScenarioArgument,
     Weighing,
@@ -21,6 +22,7 @@ from stochfuse.cli.options import (
     choice,
     option,
     settings_for,
+    tell,
 )
 from stochfuse.errors import UsageError
 from stochfuse.scenario.registry import GENERAL, METHODS, MONTE_CARLO, SIMPLIFIED
@@ -68,17 +70,19 @@ def crosscheck(
     graphs: Graphs = Graphs(),
     weighing: Weighing = Weighing(),
     to: Written = Written(),
+    page: Reported = Reported(),
 ) -> None:
-    """Compare a simulator's results with the prediction; exit 0 if they agree, 1 if they do not.
+    """Compare a simulator's results with the prediction; exit 1 if they disagree.
 
     Values: covariance (claimed, as the metric says; default: trace) or covariance:METRIC, squared_error,
-    error:STATE (signed), nees; one or several. Per cell a z-score; the verdict corrects for their number.
+    error:STATE (signed), nees; one or several. The verdict corrects for the number of cells.
     """
     from stochfuse.data.crosscheck import crosscheck as check
     from stochfuse.data.results import read_results
     from stochfuse.report import crosschecks
 
     to.check(file, scenario)
+    page.check(to.output, to.plot, file, scenario)
     given = {"estimator": estimator, **sampling._asdict(), **precisely._asdict()}
     given |= {**graphs._asdict(), **weighing._asdict()}
     settings = settings_for([GENERAL, MONTE_CARLO] if method is None else [method], **given)
@@ -90,18 +94,18 @@ def crosscheck(
     chosen, link = changes.of(scenario)
     verdict = check(results, chosen, method=method, metric=metric, alpha=alpha, link=link, **settings)
     shown = crosschecks.CrosscheckView(verdict, to.digits)
-    for note in dict.fromkeys((*verdict.prediction.notes, *verdict.notes)):
-        typer.echo(f"note: {note}", err=True)
+    notes = [*verdict.prediction.notes, *verdict.notes]
     if method == SIMPLIFIED:
-        typer.echo("note: the simplified formulation is approximate: a right simulator differs from it", err=True)
+        notes.append("the simplified formulation is approximate: a right simulator differs from it")
     for code, ratio in verdict.consistency.items():
         where = f" at µ = {code}" if code else ""
-        typer.echo(f"note: mean squared error{where} is {ratio:.3g} times the mean claimed covariance", err=True)
-    to.write(crosschecks.crosscheck_report(shown))
-    for text in verdict.evidence:
-        typer.echo(f"evidence: {text}", err=True)
+        notes.append(f"mean squared error{where} is {ratio:.3g} times the mean claimed covariance")
+    said, report = tell(f"note: {note}" for note in notes), crosschecks.crosscheck_report(shown)
+    to.write(report)
+    said += tell(f"evidence: {text}" for text in verdict.evidence)
+    said += tell(() if verdict.agrees else ["the results disagree with the prediction"])
+    page.write(report, chosen.to_mapping(), said)
     if not verdict.agrees:
-        typer.echo("the results disagree with the prediction", err=True)
         raise typer.Exit(1)
 
 

@@ -163,7 +163,7 @@ def _by_protocol(
     other: dict[str, Any],
     window: tuple[int | None, int | None],
     agent: str,
-    shown: Shown,
+    shown: Listed,
     sampling: Sampling,
     to: Written,
 ) -> None:

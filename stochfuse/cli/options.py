@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextvars import ContextVar
 from functools import wraps
 from math import floor, inf, isfinite, log10
 from pathlib import Path
@@ -103,6 +104,9 @@ FormatOption = Annotated[
     choice(FORMATS, f"{', '.join(FORMATS)}; default: table, or by the name of --output.", OUTPUT, "--format", "-f"),
 ]
 PlotOption = Annotated[Path | None, option("Also draw a figure: .png, .svg or .pdf.", OUTPUT, metavar="FILE")]
+PageOption = Annotated[
+    Path | None, option("A page to send: result, figure, what was asked: .html.", OUTPUT, metavar="FILE")
+]
 DigitsOption = Annotated[
     int, option("Significant digits in tables; default: 5.", OUTPUT + RARE, min=1, max=17, metavar="N")
 ]
@@ -323,6 +327,37 @@ class Written(NamedTuple):
         write_report(report, self.kind, self.output)
 
 
+class Reported(NamedTuple):
+    """Where the page goes that can be sent."""
+
+    report: PageOption = None
+
+    def check(self, *others: Path | str | None) -> None:
+        """Raise UsageError early if the page can never be written, or is one of the other files."""
+        check_page(self.report, *others)
+
+    def write(self, report: Report, scenario: Mapping[str, Any], said: Sequence[str] = ()) -> None:
+        """Write the page, where it is asked for; with the words of the command line and what was said beside it."""
+        if self.report is None:
+            return
+        from stochfuse.report.document import Told, document
+        from stochfuse.report.table import write_text
+
+        write_text(document(report, Told(WORDS.get(), scenario, tuple(said))), self.report)
+
+
+WORDS: ContextVar[tuple[str, ...]] = ContextVar("WORDS", default=())
+"""Words of the command line, without the program's name."""
+
+
+def tell(lines: Iterable[str]) -> list[str]:
+    """Write lines to standard error, each once, and return them."""
+    told = list(dict.fromkeys(lines))
+    for line in told:
+        typer.echo(line, err=True)
+    return told
+
+
 def gathered(command: Callable[..., None]) -> Callable[..., None]:
     """Lay out a command's groups of options as single ones, in the order of its parameters."""
     hints = get_type_hints(command, include_extras=True)
@@ -495,6 +530,16 @@ def check_files(output: Path | None, plot: Path | None, *inputs: str) -> None:
         for source in inputs:
             if file is not None and file.exists() and Path(source).exists() and file.samefile(source):
                 raise UsageError(f"{option}: expected another file than the input {source}, which it would overwrite")
+
+
+def check_page(page: Path | None, *others: Path | str | None) -> None:
+    """Raise UsageError early if a page can never be written, or is one of the other files."""
+    from stochfuse.report.table import check_writable
+
+    check_writable(page, (".html", ".htm"))
+    for other in others if page is not None else ():
+        if other is not None and page is not None and page.resolve() == Path(other).resolve():
+            raise UsageError(f"--report: expected another file than {other}, which it would overwrite")
 
 
 def parse_link(text: str) -> list[float]:

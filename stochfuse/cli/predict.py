@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
-
-import typer
 
 from stochfuse.cli.options import (
     PLACES,
@@ -20,6 +19,7 @@ from stochfuse.cli.options import (
     OverOption,
     Precisely,
     QuantityOption,
+    Reported,
     Sampling,
     ScenarioArgument,
     Weighing,
@@ -29,6 +29,7 @@ from stochfuse.cli.options import (
     quantity_names,
     settings_for,
     steps_at,
+    tell,
     whose,
 )
 from stochfuse.errors import UsageError
@@ -78,10 +79,11 @@ def predict(
     graphs: Graphs = Graphs(),
     weighing: Weighing = Weighing(),
     to: Written = Written(),
+    page: Reported = Reported(),
 ) -> None:
     """Tabulate the expected fused covariance against link probability.
 
-    Without a scenario: the thesis' transient one. Options override the scenario.
+    Without a scenario: the thesis' transient one. Options override it.
     """
     from stochfuse.kalman.metrics import metric as metric_of
     from stochfuse.prediction.method import Shown
@@ -90,6 +92,7 @@ def predict(
     from stochfuse.report.predictions import PredictionView, report
 
     to.check(scenario, *([] if measurements is None else [measurements]))
+    page.check(to.output, to.plot, scenario, measurements)
     if quantity == STATE:
         flags = {"--over": over, "--metric": metric, "--normalise": normalise, "--steady": steady}
         flags |= {"--interval": interval, "--statistic": statistic != "mean"}
@@ -100,7 +103,7 @@ def predict(
         settings = settings_for(
             [way], **{"estimator": estimator, **sampling._asdict(), **precisely._asdict(), **graphs._asdict()}
         )
-        _states(scenario, changes, measurements, StatesAsked(way, agent, at), settings, to)
+        _states(scenario, changes, measurements, StatesAsked(way, agent, at), settings, to, page)
         return
     if measurements is not None:
         raise UsageError(f"--measurements: expected --quantity {STATE} to go with it, got {quantity}")
@@ -150,8 +153,9 @@ def predict(
     )
     for view in views:
         view.values()  # a request that cannot be met should say so before notes and figures
-    _warn(views)
-    to.write(report(views))
+    said, shown = tell(_said(views)), report(views)
+    to.write(shown)
+    page.write(shown, given.to_mapping(), said)
 
 
 class StatesAsked(NamedTuple):
@@ -169,6 +173,7 @@ def _states(
     asked: StatesAsked,
     settings: dict[str, Any],
     to: Written,
+    page: Reported,
 ) -> None:
     """Show the expected state over what arrives, given one record of measurements."""
     from stochfuse.data.records import read_records
@@ -185,27 +190,25 @@ def _states(
     if agent in ("worst", "best"):
         raise UsageError(f"--agent: expected mean or a number with --quantity {STATE}, got {agent}")
     found = expected_states(records.scenario, records.one_run(), links, asked.method, **settings)
-    for note in records.notes:
-        typer.echo(f"note: {note}", err=True)
-    to.write(states_report(StatesView(found, agent, steps, to.digits)))
+    said = tell(f"note: {note}" for note in records.notes)
+    shown = states_report(StatesView(found, agent, steps, to.digits))
+    to.write(shown)
+    page.write(shown, records.scenario.to_mapping(), said)
 
 
-def _warn(views: tuple[PredictionView, ...]) -> None:
+def _said(views: tuple[PredictionView, ...]) -> Iterator[str]:
+    """Notes and warnings beside a prediction."""
     first = views[0]
     if first.sampled and first.agent in ("worst", "best") and not first.prediction.alike:
-        typer.echo(
-            f"note: which agent is the {first.agent} is judged by the same sample: the value is biased", err=True
-        )
-    for note in dict.fromkeys(note for view in views for note in view.prediction.notes):
-        typer.echo(f"note: {note}", err=True)
+        yield f"note: which agent is the {first.agent} is judged by the same sample: the value is biased"
+    for view in views:
+        yield from (f"note: {note}" for note in view.prediction.notes)
     if first.metric.mixed and not first.baseline:
         model = first.prediction.scenario.model
         names = ", ".join(f"{n} [{u}]" for n, u in zip(model.states, model.units, strict=True))
-        typer.echo(f"note: {first.metric.name} adds up different units ({names}); see --metric", err=True)
-    for view in views:
-        text = view.overconfidence()
-        if text:
-            typer.echo(f"warning: {text}", err=True)
-            break
-    for note in dict.fromkeys(note for view in views for limit in view.limits for note in limit.notes):
-        typer.echo(f"note: {note}", err=True)
+        yield f"note: {first.metric.name} adds up different units ({names}); see --metric"
+    warning = next(filter(None, (view.overconfidence() for view in views)), None)
+    if warning is not None:
+        yield f"warning: {warning}"
+    for note in (note for view in views for limit in view.limits for note in limit.notes):
+        yield f"note: {note}"

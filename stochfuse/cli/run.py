@@ -20,6 +20,7 @@ from stochfuse.cli.options import (
     FormatOption,
     MetricOption,
     PlotOption,
+    Reported,
     ScenarioArgument,
     Written,
     check_files,
@@ -29,6 +30,7 @@ from stochfuse.cli.options import (
     option,
     pairs,
     parse_link,
+    tell,
     write_report,
 )
 from stochfuse.errors import UsageError
@@ -132,6 +134,7 @@ def run(
     ] = None,
     plot: PlotOption = None,
     digits: DigitsOption = 5,
+    page: Reported = Reported(),
 ) -> None:  # fmt: skip
     """Run estimators on measurements; show realised, claimed and predicted errors, and whether claims are consistent.
 
@@ -162,6 +165,7 @@ def run(
         raise UsageError("expected at most one file on standard input, got - for several")
     check_estimates(output)
     check_files(output, plot, scenario, *files)
+    page.check(output, plot, scenario, *files)
     given, links = changes.of(scenario)
     first = initial or beside(measurements)
     records = read_records(given, measurements, arrivals, truth, first, pairs("--columns", columns))
@@ -174,7 +178,7 @@ def run(
         raise UsageError("--covariance: expected --output FILE to write them to")
     with writing as file:
         found = run_records(records, chosen, way, None if file is None else file.write)
-    show(found, format, plot, digits)
+    show(found, format, plot, digits, page)
 
 
 def check_robots(robots: RobotOptions, others: Mapping[str, object], metric: str | None) -> None:
@@ -204,19 +208,17 @@ def show_robots(
     written.write(robot_report(found, min(written.digits, 3)))
 
 
-def show(found: RunResult, format: str | None, plot: Path | None, digits: int) -> None:
+def show(found: RunResult, format: str | None, plot: Path | None, digits: int, page: Reported = Reported()) -> None:
     """Write a run's notes, report and figure."""
     from stochfuse.report.plot import save
     from stochfuse.report.runs import run_report
 
     report = run_report(found, digits)
-    for note in found.notes:
-        typer.echo(f"note: {note}", err=True)
-    for suspicion in found.suspicions:
-        typer.echo(f"note: {suspicion.text}", err=True)
+    said = tell(f"note: {note}" for note in (*found.notes, *(suspicion.text for suspicion in found.suspicions)))
     if plot is not None and report.draw is not None:
         save(report.draw, plot)
     write_report(report, chosen_format(format, None), None)
+    page.write(report, found.scenario.to_mapping(), said)
 
 
 def one_link(links: list[float] | None, case: str | None = None) -> float | str | None:

@@ -18,9 +18,11 @@ from stochfuse.cli.options import (
     SHOWN,
     WORK,
     DigitsOption,
+    Reported,
     Written,
     choice,
     option,
+    tell,
 )
 from stochfuse.cli.progress import quiet
 from stochfuse.errors import UsageError
@@ -96,6 +98,7 @@ def study(
         str | None, choice(FORMATS, "Format of what is shown; default: table.", OUTPUT, "--format", "-f")
     ] = None,
     digits: DigitsOption = 5,
+    page: Reported = Reported(),
 ) -> None:
     """Predict many points: a grid, a list or a Latin hypercube over scenario keys and methods.
 
@@ -108,11 +111,13 @@ def study(
     from stochfuse.studies.running import study as run
 
     check_files(output, plot, study)
+    page.check(output, plot, study)
+    drawn = plot is not None or page.report is not None
     for flag, value in (("--over", looked.over), ("--kind", looked.kind)):
-        if value is not None and (plot is None or looked.pareto):
+        if value is not None and (not drawn or looked.pareto):
             raise UsageError(f"{flag}: expected --plot without --pareto")
     for flag, value in (("--where", looked.where or None), ("--column", looked.column), ("--step", looked.step)):
-        if value is not None and plot is None and not looked.pareto:
+        if value is not None and not drawn and not looked.pareto:
             raise UsageError(f"{flag}: expected --plot or --pareto")
     if dask is not None and workers != 1:
         raise UsageError("--workers: expected nothing with --dask, whose cluster has its own")
@@ -125,7 +130,7 @@ def study(
             command = "the same command without --restart" if restart else "the same command"
             typer.echo(f"note: finished points are kept: {command} goes on", err=True)
             raise
-    _tell(results)
+    said = tell(_failed(results))
     from stochfuse.report import study_figures as studies
 
     to, where = Written(format, None, plot, digits), _pairs(looked.where or [])
@@ -134,27 +139,25 @@ def study(
         from stochfuse.studies.pareto import pareto
 
         front = pareto(results, looked.column, looked.step, fixed_values(results.plan, where))
-        for note in front.notes:
-            typer.echo(f"note: {note}", err=True)
-        to.write(studies.pareto_report(front, results, digits))
+        said += tell(f"note: {note}" for note in front.notes)
+        shown = studies.pareto_report(front, results, digits)
+        to.write(shown)
+        page.write(shown, results.plan.base, said)
         return
     keys = None if looked.over is None else tuple(key.strip() for key in looked.over.split(","))
-    to.write(
-        studies.summary_report(results, digits, (keys, looked.column, looked.kind or KINDS[0], where, looked.step))
-    )
+    shown = studies.summary_report(results, digits, (keys, looked.column, looked.kind or KINDS[0], where, looked.step))
+    to.write(shown)
+    page.write(shown, results.plan.base, said)
 
 
-def _tell(results: Results) -> None:
+def _failed(results: Results) -> Iterator[str]:
     from stochfuse.errors import StochfuseError
 
     if results.failed:
         point, reason = results.first_errors[0]
         if results.failed == results.plan.size:
             raise StochfuseError(f"all {results.failed} points failed (see {results.path}); the first: {reason}")
-        typer.echo(
-            f"warning: {results.failed} of {results.plan.size} points failed; the first, point {point}: {reason}",
-            err=True,
-        )
+        yield f"warning: {results.failed} of {results.plan.size} points failed; the first, point {point}: {reason}"
 
 
 def _pairs(texts: list[str]) -> dict[str, str]:

@@ -13,7 +13,7 @@ from stochfuse.data.protocols import ProtocolLoad, Sampled
 from stochfuse.kalman.metrics import Metric
 from stochfuse.prediction import quantities
 from stochfuse.report.plot import COLORS, MARKERS, below, figure_class, titled
-from stochfuse.report.rows import Rows
+from stochfuse.report.rows import ResultRows
 from stochfuse.report.table import Report, Table, number, to_csv
 from stochfuse.scenario import registry
 
@@ -45,9 +45,9 @@ class ProtocolView:
     digits: int = 5
 
     @cached_property
-    def rows(self) -> Rows:
+    def rows(self) -> ResultRows:
         """What the rows stand for."""
-        return Rows(self.found)
+        return ResultRows(self.found)
 
     def accuracy(self, protocol: int) -> Sampled | None:
         """Of a protocol, where it is asked for."""

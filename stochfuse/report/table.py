@@ -278,7 +278,13 @@ def to_html(table: Table | Sequence[Table]) -> str:
     """Return an HTML table under its title, as notebooks show it."""
     if not isinstance(table, Table):
         return "".join(map(to_html, table))
-    line = lambda kind, cells: "<tr>" + "".join(f"<{kind}>{escape(cell)}</{kind}>" for cell in cells) + "</tr>"  # noqa: E731
+    keys = len(table.keys)
+
+    def line(kind: str, cells: Sequence[str]) -> str:
+        named = [' class="key"'] * keys + [""] * (len(cells) - keys)
+        pairs = zip(named, cells, strict=True)
+        return "<tr>" + "".join(f"<{kind}{name}>{escape(cell)}</{kind}>" for name, cell in pairs) + "</tr>"
+
     title = "".join(f"<div>{escape(text)}</div>" for text in table.title)
     shown, left_out = _shortened(table)
     body = "".join(line("td", row) for row in shown.rows)

@@ -124,6 +124,7 @@ VALUES: dict[str, Sequence[str]] = {
     "--format": FORMATS,
     "--output": ("out.csv", "out.json", "out.txt", "out.md") * 3 + ("nowhere/out.csv", "mine.toml", "."),
     "--plot": ("figure.svg", "figure.gif", "nowhere/figure.svg", "out.svg"),
+    "--report": ("page.html", "page.pdf", "none/page.html"),
     "--digits": ("1", "5", "17"),
     "--target": ("30", "30", "50", "1e-3", "0", "1e9"),
     "--step": ("1", "2", "3"),
@@ -188,7 +189,15 @@ SMALL = {"--agents": "2", "--steps": "2", "--max-graphs": "300", "--runs": "3", 
 """What keeps a line short, where it is not drawn."""
 WEIGHTS = {"predict": 12, "solve": 8, "compare": 5, "messages": 4, "crosscheck": 3, "links": 3, "graph": 2, "study": 2}
 WEIGHTS |= {"scenario list": 0.2, "doctor": 0.2, "methods": 0.4, "scenario schema": 0.2}
-SELDOM = {"--plot": 0.1, "--output": 0.5, "--normalise": 0.5, "--interval": 0.3, "--case": 0.2, "--workers": 0.3}
+SELDOM = {
+    "--plot": 0.1,
+    "--report": 0.1,
+    "--output": 0.5,
+    "--normalise": 0.5,
+    "--interval": 0.3,
+    "--case": 0.2,
+    "--workers": 0.3,
+}
 """How often an option is kept that was drawn: what takes long, or goes with little else."""
 FOR = {
     "--runs": "monte-carlo", "--seed": "monte-carlo", "--workers": "monte-carlo", "--max-graphs": "general",
@@ -215,6 +224,8 @@ def options() -> dict[str, tuple[Flag, ...]]:
     root: Any = typer.main.get_command(app)
     found = {}
     for name in COMMANDS:
+        if name == "explore":  # a server does not end
+            continue
         command = root.get_command(None, name)
         for path, each in {
             f"{name} {sub}": one for sub, one in getattr(command, "commands", {name: command}).items()

@@ -1,0 +1,137 @@
+"""The network as it is drawn: agents at their places, a link as an arc from sender to receiver, what each is worth.
+
+Each way has an arc of its own, bent to one side of the chord, so that it can be pointed at.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from stochfuse.errors import StochfuseError
+from stochfuse.explore.state import Asked
+from stochfuse.prediction.predict import predict
+from stochfuse.report.network_figure import BEND, LEAST
+from stochfuse.scenario.known_links import links_of_scenario
+from stochfuse.scenario.network import reachable
+from stochfuse.scenario.registry import SIMPLIFIED
+
+MOST_LINKED = 30
+"""Agents up to which links are drawn one by one."""
+POINTS = 17
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What is drawn.
+
+    Parameters
+    ----------
+    names : of the agents.
+    places : (agents, 2); on a circle where the scenario has none.
+    metres : whether places are in metres.
+    link : (agents, agents) probabilities, receiver × sender, NaN where there is no link.
+    step : the step that is drawn, where links vary with the step; else None.
+    errors : (agents,) each agent's own number, of the simplified formulation at the last step; NaN where it has none.
+    worth : dE/dµ of links, by (receiver, sender).
+    first : the links to improve first.
+    """
+
+    names: tuple[str, ...]
+    places: np.ndarray
+    metres: bool
+    link: np.ndarray
+    step: int | None
+    errors: np.ndarray
+    worth: dict[tuple[int, int], float] = field(default_factory=dict)
+    first: frozenset[tuple[int, int]] = frozenset()
+
+    def weighed(self, worth: dict[tuple[int, int], float], first: set[tuple[int, int]]) -> Picture:
+        """Return the same with what links are worth."""
+        return replace(self, worth=worth, first=frozenset(first))
+
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Links as (receiver, sender), those that are there."""
+        if len(self.names) > MOST_LINKED:
+            return []
+        return [(int(i), int(j)) for i, j in np.argwhere(~np.isnan(self.link))]
+
+    def arc(self, receiver: int, sender: int) -> np.ndarray:
+        """Points of a link's arc, (points, 2)."""
+        start, end = self.places[sender], self.places[receiver]
+        t = np.linspace(0.0, 1.0, POINTS)[:, None]
+        middle = (start + end) / 2 + 2 * BEND * np.array([end[1] - start[1], start[0] - end[0]])
+        return (1 - t) ** 2 * start + 2 * t * (1 - t) * middle + t**2 * end
+
+    def width(self, pair: tuple[int, int]) -> float:
+        """Width of a link's arc: the more it is worth, the wider."""
+        most = max((abs(slope) for slope in self.worth.values()), default=0.0)
+        return 2.0 + (6.0 * abs(self.worth.get(pair, 0.0)) / most if most else 0.0)
+
+    def name(self, pair: tuple[int, int]) -> str:
+        """A link in words."""
+        return f"{self.names[pair[1]]} → {self.names[pair[0]]}"
+
+    def about_link(self, pair: tuple[int, int], asked: Asked) -> str:
+        """Say what a link is and what it is worth."""
+        at = f" in step {self.step}" if self.step else ""
+        text = f"Link {self.name(pair)}: µ = {self.link[pair]:.4g}{at}."
+        if pair not in self.worth:
+            return text
+        slope = self.worth[pair]
+        rank = 1 + sum(abs(other) > abs(slope) * (1 + 1e-9) for other in self.worth.values())
+        best = " It is one to improve first." if pair in self.first else ""
+        return (
+            f"{text} Per hundredth of µ more, {asked.measure.label} changes by {slope / 100:.4g} (dE/dµ = {slope:.5g}, "
+            f"simplified); rank {rank} of {len(self.worth)}.{best}"
+        )
+
+    def about_agent(self, i: int, asked: Asked) -> str:
+        """Say what an agent has and gets."""
+        scenario = asked.scenario
+        sensor = scenario.sensors[scenario.sensor_of[i]]
+        heard = [float(µ) for µ in self.link[i] if not np.isnan(µ) and µ > LEAST]
+        seen = (
+            "no sensor" if not sensor.H.size or not np.any(sensor.H) else f"a sensor of {sensor.H.shape[-2]} number(s)"
+        )
+        error = (
+            "" if np.isnan(self.errors[i]) else f" Its own {asked.measure.label}: {self.errors[i]:.5g} (simplified)."
+        )
+        mean = f", with µ = {np.mean(heard):.3g} on average" if heard else ""
+        return f"Agent {self.names[i]}: {seen}; hears {len(heard)} other(s){mean}.{error}"
+
+
+def picture(asked: Asked) -> Picture:
+    """Return the network of what is asked, without what its links are worth.
+
+    Raises
+    ------
+    UsageError, NoAnswerError
+        If the scenario's links cannot be laid out.
+    """
+    scenario, n = asked.scenario, asked.scenario.network.agents
+    step = None
+    alike = asked.link if asked.kind == "link" else None
+    if alike is not None:
+        link = np.where(reachable(scenario.network), alike, np.nan)
+    else:
+        known = links_of_scenario(scenario).link
+        link = np.where(reachable(scenario.network), known, np.nan)
+        if link.ndim == 3:
+            step, link = len(link), link[-1]
+    np.fill_diagonal(link, np.nan)
+    where = scenario.network.places
+    if where:
+        places = np.array([place[-1, :2] if place.ndim == 2 else place[:2] for place in where])
+    else:
+        angle = 2 * np.pi * np.arange(n) / n
+        places = np.stack([np.sin(angle), np.cos(angle)], axis=1)
+    try:
+        found = predict(scenario, None if alike is None else [alike], SIMPLIFIED)
+        errors = np.array([found.values(asked.measure, i + 1)[0, -1] for i in range(n)])
+    except StochfuseError:  # which the curves say
+        errors = np.full(n, np.nan)
+    names = scenario.network.names or tuple(str(i + 1) for i in range(n))
+    return Picture(names, places, bool(where), link, step, errors)
