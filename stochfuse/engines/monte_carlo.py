@@ -28,7 +28,7 @@ BLOCK, MOST_OF_BLOCK = 1000, 60
 """Runs drawn from one seed, of networks of at most so many agents; see `blocks_of`."""
 MOST_BLOCKS = 50
 """Blocks that a process has in hand at a time."""
-MOST_TOGETHER, MOST_NUMBERS = 32, 1 << 26
+MOST_TOGETHER, MOST_NUMBERS = 200, 1 << 26
 """Runs that are followed at a time, and numbers that are held for them."""
 DRAWN = 1 << 20
 """Random numbers that are drawn at a time."""

@@ -190,7 +190,7 @@ class GraphTogether:
         rows, keys, run = rows[first], keys[first], run[first]
         places = self._add(level, keys, 0.0)
         tops, number = self._maximal(rows, run * self.agents)
-        for heard in np.unique(number).tolist():
+        for heard in np.flatnonzero(np.bincount(number)).tolist():
             members = np.flatnonzero(number == heard)
             begin = 0
             while begin < len(members):
@@ -205,7 +205,7 @@ class GraphTogether:
                 first, which = _different(term_keys)
                 different, levels = term_keys[first], terms.rows[first, : self.agents].max(axis=1).astype(np.intp)
                 unknown = self._places(levels, different) < 0
-                for below in np.unique(levels[unknown]).tolist():
+                for below in np.flatnonzero(np.bincount(levels[unknown])).tolist():
                     here = first[unknown & (levels == below)]
                     wanted.setdefault(below, []).append((terms.rows[here], term_keys[here], run[some][of[here]]))
                 ends = np.searchsorted(of, np.arange(len(some) + 1))
@@ -271,7 +271,7 @@ class GraphTogether:
     def _places(self, levels: np.ndarray, keys: np.ndarray) -> np.ndarray:
         """Where the values of sets stand, −1 where a set is new."""
         out = np.full(len(keys), -1, dtype=np.intp)
-        for level in np.unique(levels).tolist():
+        for level in np.flatnonzero(np.bincount(levels)).tolist():
             if level in self._found:
                 known, places = self._found[level]
                 here = np.flatnonzero(levels == level)

@@ -35,7 +35,7 @@ from stochfuse.engines.contact_chain import (
 from stochfuse.engines.enclosure import ROUNDING, enclosed, half_width
 from stochfuse.engines.precision import PROMISED
 from stochfuse.engines.progress import listener
-from stochfuse.errors import NoAnswerError, ScenarioError, StochfuseError
+from stochfuse.errors import NoAnswerError, ScenarioError, StochfuseError, UsageError
 from stochfuse.kalman.metrics import Moments
 from stochfuse.prediction import optimal
 from stochfuse.prediction.method import Settings, group_of
@@ -97,6 +97,10 @@ def period_of(scenario: Scenario, rows: LinkRows) -> int:
         If it never does.
     """
     capabilities.require_endless(scenario.system, rows, periodic=True)
+    if any((M[1:] != M[1:2]).any() for M in _by_step(scenario)):
+        raise UsageError(
+            f"a steady state needs {capabilities.ENDLESS}; got filters or relations that vary with the step"
+        )
     if not (scenario.model.varies or any(sensor.varies for sensor in scenario.sensors)):
         return 1
     steps = 3 * LONGEST_PERIOD + 1
@@ -116,12 +120,22 @@ def period_of(scenario: Scenario, rows: LinkRows) -> int:
 def prolonged(scenario: Scenario, steps: int) -> Scenario:
     """Return the same with another number of steps; sensors with periods go on."""
     network = replace(scenario.network, steps=steps)
-    if not (scenario.model.varies or any(sensor.varies for sensor in scenario.sensors)):
+    if any(µ is not None and µ.ndim in (1, 3) for µ in (network.link, *(µ for _, µ in network.cases))):
+        network = replace(network, link=None, cases=())  # other links are asked about
+    if not (scenario.model.varies or any(sensor.varies for sensor in scenario.sensors) or _by_step(scenario)):
         return replace(scenario, network=network)
     mapping = scenario.to_mapping()
     mapping["network"] = {**mapping.get("network", {}), "steps": steps}
     made = Scenario.from_mapping(mapping, scenario.name)
-    return replace(scenario, network=network, model=made.model, sensors=made.sensors, nominal=made.nominal)
+    names = ("model", "sensors", "nominal", "filters", "noise", "process", "relations")
+    return replace(scenario, network=network, **{name: getattr(made, name) for name in names})
+
+
+def _by_step(scenario: Scenario) -> list[np.ndarray]:
+    """Matrices of filters and of what agents measure of one another that are written down for every step."""
+    matrices = [M for f in scenario.filters for M in (f.F, f.Q)] + [M for M in (scenario.process,) if M is not None]
+    matrices += [M for relation in scenario.relations.values() for M in relation if isinstance(M, np.ndarray)]
+    return [M for M in matrices if M.ndim > 2]
 
 
 def _found(prediction: Prediction, P: np.ndarray, nature: str) -> Prediction:

@@ -137,6 +137,17 @@ def test_samples_without_chance_are_as_good_as_exact():
     np.testing.assert_array_equal(p.steady_error(), 0)
 
 
+def test_what_nodes_measure_of_one_another_along_their_paths_ends():
+    with pytest.raises(sf.UsageError, match="got filters or relations that vary with the step"):
+        sf.predict("cooperative-pnt", [0.5], method="monte-carlo", estimator="lwin", runs=10, steady=True)
+
+
+@pytest.mark.slow
+def test_parallel_filters_that_never_see_where_they_are_have_none():
+    with pytest.raises(sf.NoAnswerError, match="two samples of the same arrivals that start far apart do not agree"):
+        sf.predict("parallel-filters", [0.5], method="monte-carlo", estimator="blender", runs=3, steady=True)
+
+
 @pytest.mark.parametrize("method", ["optimal", "monte-carlo"])
 def test_what_grows_without_end_has_none(method):
     """1 − µ of what is F² times as large after a step, at least 1/1.44 = 0.694 of it."""
