@@ -19,7 +19,7 @@ of the sample at that step is that of the steady state.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import fields, replace
 from itertools import product
 from typing import Any
 
@@ -339,7 +339,8 @@ class _Wanted:
         """Sample as many steps as a scenario has."""
         from stochfuse.prediction.predict import predict
 
-        settings = asdict(replace(how, estimator=self.prediction.estimator))
+        how = replace(how, estimator=self.prediction.estimator, precision=None, at_most=None)
+        settings = {field.name: getattr(how, field.name) for field in fields(how)}
         quantity = "rms" if self.prediction.with_actual else "claimed"
         found = predict(scenario, self.rows, MONTE_CARLO, quantity, **settings)
         shown = self.prediction.quantity

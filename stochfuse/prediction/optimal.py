@@ -99,7 +99,7 @@ def averaged(system: System, items: Items, how: Settings, errors: bool) -> Avera
 def _sampled(system: System, items: Items, how: Settings, errors: bool, why: str) -> Averaged:
     """Sample the optimum where a chain does not take it, and say why."""
     found = sampled.averaged(system, items, replace(how, estimator=OPTIMAL), errors)
-    return found._replace(notes=(*found.notes, f"{why}: sampled, {how.runs:,} runs; ± standard error"))
+    return found._replace(notes=(f"{why}: sampled, {found.meta['runs']:,} runs; ± standard error", *found.notes))
 
 
 def _every_path(system: System, items: Items, chain: Contacts, paths: int | None) -> Chain:

@@ -352,7 +352,7 @@ def rare(system: System, links: LinkRows, found: Sampled) -> list[str]:
     said, claimed = [], Moments(found.sample.values.P)
     for row, µ in enumerate(links.means(system.network)):
         others = [
-            found.runs - np.unique(np.round(traces / np.abs(traces).max(), 12), return_counts=True)[1].max()
+            found.runs - np.unique(np.round(traces / (np.abs(traces).max() or 1.0), 12), return_counts=True)[1].max()
             for step, g in np.ndindex(found.odds.shape[1:])
             if found.scarce(row, step, g)
             for traces in [np.trace(found.in_runs(claimed, row, step, g).P, axis1=-2, axis2=-1)]

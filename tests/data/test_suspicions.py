@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import stochfuse as sf
-from stochfuse.data.innovations import Case, innovations, setting_of
+from stochfuse.data.innovations import Supposition, innovations, setting_of
 from stochfuse.data.simulate import Draws
 from stochfuse.data.suspicions import suspicions
 from stochfuse.scenario.scenario import link_rows
@@ -200,7 +200,7 @@ def test_likelihood_is_that_of_the_joint_normal_distribution():
         each[:, 0] = np.nan
     z[1][:, 2] = np.nan
     ones = (np.ones(1),) * 2
-    found = innovations(setting_of(s.system, (), ()), [Case(tuple(z), ones, ones)])
+    found = innovations(setting_of(s.system, (), ()), [Supposition(tuple(z), ones, ones)])
     at = [(k, i) for k in range(4) for i in range(2) if not np.isnan(z[i][0, k, 0])]
     C = np.array([[7.0 + 3.0 * min(k, m) + 2.0 * ((k, i) == (m, j)) for m, j in at] for k, i in at])
     v = np.array([z[i][0, k, 0] for k, i in at])
@@ -216,9 +216,9 @@ def test_other_units_are_as_likely_as_they_are():
     z = tuple(np.where((np.arange(30) > 0)[:, None], each, np.nan) for each in batch.z)
     ones = (np.ones(2),) * 3
     setting = setting_of(s.system, (), batch.first)
-    true = innovations(setting, [Case(z, ones, ones)])
+    true = innovations(setting, [Supposition(z, ones, ones)])
     thousand = tuple(np.full(2, 1000.0) for _ in z)
-    small = innovations(setting, [Case(z, thousand, ones)])
+    small = innovations(setting, [Supposition(z, thousand, ones)])
     assert small.likelihood[0] - true.likelihood[0] == pytest.approx(3 * 29 * 2 * np.log(1000.0), rel=1e-9)
 
 

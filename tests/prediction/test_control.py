@@ -193,7 +193,7 @@ def test_the_same_arrivals_for_more_agents_than_words_have_bits():
     """Step 1 by hand from the very draws that other estimators are given: P(k0) over the number of arrivals."""
     scenario = sf.load_scenario("thesis-transient", agents=70, steps=1)
     links = link_rows(scenario, [0.1])
-    found = sample_optimum(scenario.system, links, 5, 3, paired=True, first=2)
+    found = sample_optimum(scenario.system, links, 5, 3, first=2)
     happens = events(scenario.network, links, 1)
     (fates,), _ = draw_fates(stream(3, 0, 2), [happens], [[]], (5, 70))
     heard = np.ones((5, 70))
