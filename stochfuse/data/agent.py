@@ -38,6 +38,7 @@ from stochfuse.kalman.kernel import Estimate, Information, at_step
 from stochfuse.prediction.predict import choose
 from stochfuse.scenario import capabilities, registry
 from stochfuse.scenario.network import default_rows, reachable
+from stochfuse.scenario.own_rules import estimator_named
 from stochfuse.scenario.scenario import Scenario, ScenarioLike, load_scenario
 
 SAVED = b"SFA1"
@@ -90,15 +91,14 @@ class Agent:
         self,
         scenario: ScenarioLike,
         agent: int | str,
-        estimator: str | None = None,
+        estimator: Any = None,
         *,
         protocol: str | MessageProtocol = "acknowledged",
         start: Start | None = None,
         criterion: str = "det",
     ) -> None:
         given = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
-        name = estimator or given.estimator or registry.LFG
-        choose("estimator", name, registry.ESTIMATORS)
+        name = estimator_named(estimator or given.estimator or registry.LFG)
         choose("criterion", criterion, registry.CRITERIA)
         self.scenario, self.estimator, self.criterion = given, name, criterion
         number, start = _number(given, agent), start or Start()
@@ -300,12 +300,13 @@ class Agent:
         return whole + zlib.crc32(whole).to_bytes(4, "little")
 
     @classmethod
-    def load(cls, data: bytes, scenario: ScenarioLike) -> Agent:
+    def load(cls, data: bytes, scenario: ScenarioLike, estimator: Any = None) -> Agent:
         """Start an agent again from what it saved.
 
         Parameters
         ----------
         data : of `save`, by an agent of this scenario.
+        estimator : the rule of your own that it had: what was saved loads no code.
 
         Raises
         ------
@@ -319,7 +320,11 @@ class Agent:
         try:
             facts = json.loads(whole[8:end])
             protocol, criterion = MessageProtocol(**facts["protocol"]), facts["criterion"]
-            agent = cls(scenario, facts["agent"], facts["estimator"], protocol=protocol, criterion=criterion)
+            name = facts["estimator"] if estimator is None else estimator_named(estimator)
+            if name != facts["estimator"] or (estimator is None and name not in registry.ESTIMATORS):
+                got = "none" if estimator is None else f"'{name}'"
+                raise MessageError(f"saved agent: expected estimator '{facts['estimator']}' to be given, got {got}")
+            agent = cls(scenario, facts["agent"], name, protocol=protocol, criterion=criterion)
             agent._restore(facts, decode(whole[end:], agent._saved_kind()))
         except (KeyError, TypeError, UnicodeDecodeError, json.JSONDecodeError) as error:
             raise MessageError(f"saved agent: expected what Agent.save returned, got other facts: {error}") from None

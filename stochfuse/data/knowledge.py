@@ -37,7 +37,7 @@ import numpy as np
 from stochfuse.data.messages import LIVES, Kind, Life, MessageProtocol, Name, Node
 from stochfuse.errors import MessageError, NoAnswerError, TooManyError, UsageError
 from stochfuse.estimators.local_fusion_graph import Pedigrees
-from stochfuse.estimators.recursion import Pasts, RecursiveEstimator, Worked, worked_out
+from stochfuse.estimators.recursion import Pasts, RecursiveEstimator, RuleError, Worked, worked_out
 from stochfuse.estimators.world import Riding, World
 from stochfuse.fusion.intersection import fuse_stack
 from stochfuse.kalman.kernel import (
@@ -677,6 +677,8 @@ class Latest(Knowledge):
         fused = estimator.fuse(self.now, agent, values, heard, due)
         try:
             self._work(fused, numbers)
+        except RuleError:
+            raise
         except (UsageError, NoAnswerError):
             if not self._here():
                 raise
@@ -690,7 +692,7 @@ class Latest(Knowledge):
             pasts = estimator.pasts
             before = [self._work(other, numbers) for other in pasts.rests_on[value]]
             estimator.magnified = 1.0
-            numbers[value] = worked_out(estimator, pasts.step[value], [pasts.rule[value]], before)
+            numbers[value] = worked_out(estimator, pasts.step[value], [pasts.rule[value]], before, [value])
         return numbers[value]
 
     def _of(self, worked: Worked) -> Node:

@@ -437,3 +437,51 @@ def test_three_processes_that_talk_udp_send_and_claim_what_is_predicted():
     assert least < np.mean([each["bytes"] for each in found]) < 5 * least
     assert max(each["most_held"] for each in found) <= 3 * 33
     assert max(each["longest"] for each in found) < 3 * 33 * 44
+
+
+class Adds:
+    """Naive fusion as a rule of one's own: information is added up."""
+
+    def fuse(self, x, P):
+        Y = np.linalg.inv(P)
+        total = np.linalg.inv(Y.sum(axis=0))
+        return total @ (Y @ x).sum(axis=0), total
+
+
+class Halves:
+    """A rule that claims a negative variance once it hears somebody."""
+
+    def fuse(self, x, P):
+        return x[0], P[0] if len(P) == 1 else -P[0]
+
+
+def both(rule):
+    return [sf.Agent(scenario(2), i, estimator=rule) for i in (1, 2)]
+
+
+def test_a_rule_of_ones_own_is_alive():
+    random = np.random.default_rng(4)
+    mine, naive = both(Adds), both("naive")
+    for k in range(5):
+        z = random.normal(size=2)
+        for pair in (mine, naive):
+            if k:
+                for agent, measured in zip(pair, z, strict=True):
+                    agent.step([measured])
+            if k != 2:
+                pair[1].receive(pair[0].message())
+            pair[0].receive(pair[1].message())
+        if k == 3:
+            with pytest.raises(sf.MessageError, match="expected estimator 'tests.data.test_agent:Adds' to be given"):
+                sf.Agent.load(mine[0].save(), scenario(2))
+            mine[0] = sf.Agent.load(mine[0].save(), scenario(2), Adds)
+        for a, b in zip(mine, naive, strict=True):
+            np.testing.assert_allclose(a.fuse()[0], b.fuse()[0], atol=1e-12)
+            np.testing.assert_allclose(a.fuse()[1], b.fuse()[1], atol=1e-12)
+
+
+def test_a_rule_that_returns_rubbish_is_named_by_a_live_agent():
+    one, other = both(Halves)
+    other.receive(one.message())
+    with pytest.raises(sf.UsageError, match="estimator tests.data.test_agent:Halves: step 1, agent 2: expected a fused P"):
+        other.fuse()
