@@ -321,7 +321,7 @@ def _events(system: System, rows: LinkRows, step: int, habits: frozenset[str]) -
     found = events(network, rows, step)
     if BOTH_WAYS in habits:
         found = [event for event in found if event.receivers[0] < event.sender]
-    if OWN_LOST in habits:
+    if OWN_LOST in habits and n > 1:
         µ = rows.matrices(network, step).mean(axis=2)
         found += [Event(n + i, (i,), µ[:, i]) for i in range(n)]
     return found

@@ -264,7 +264,8 @@ def sampled(
         found = helped(system, links, how, Sampled(drawn, groups, odds), parts, shown)
         values, error = found[0].shown(system, shown)
         there = error > 0
-        return found, float((error[there] / np.abs(values[there])).max()) if there.any() else 0.0
+        with np.errstate(divide="ignore"):  # no error but 0 is a share of 0
+            return found, float((error[there] / np.abs(values[there])).max()) if there.any() else 0.0
 
     if how.precision is None:
         (found, said, control), _ = judge(draw(None, how.runs, 0), [(how.runs, 0)])
@@ -273,7 +274,7 @@ def sampled(
     most = min(MOST_NUMBERS // numbers, MOST_HELD // numbers // system.dimension**2)
     limit = None if how.at_most is None else seconds(how.at_most)
     (found, said, control), reached = sampled_to(share(how.precision), limit, most, draw, judge)
-    meta = {"control": control._asdict(), "precision": {"asked": reached.asked, "reached": reached.reached}}
+    meta = {"control": control._asdict(), "precision": reached.for_programs}
     told = f"precision {100 * reached.reached:.2g} % of each value after {found.runs:,} runs"
     told += f", {100 * reached.asked:.3g} % asked for: {reached.stopped}" if reached.stopped else ""
     return found, tuple(filter(None, (told, said, *rare(system, links, found)))), meta
@@ -348,7 +349,7 @@ def rare(system: System, links: LinkRows, found: Sampled) -> list[str]:
     said, claimed = [], Moments(found.sample.values.P)
     for row, µ in enumerate(links.means(system.network)):
         others = [
-            found.runs - np.unique(np.round(traces / np.abs(traces).max(), 12), return_counts=True)[1].max()
+            found.runs - np.unique(np.round(traces / (np.abs(traces).max() or 1.0), 12), return_counts=True)[1].max()
             for step, g in np.ndindex(found.odds.shape[1:])
             if found.scarce(row, step, g)
             for traces in [np.trace(found.in_runs(claimed, row, step, g).P, axis1=-2, axis2=-1)]
