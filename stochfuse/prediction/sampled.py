@@ -266,7 +266,8 @@ def sampled(
         found = helped(system, links, how, Sampled(drawn, groups, odds), parts, shown)
         values, error = found[0].shown(system, shown)
         there = error > 0
-        return found, float((error[there] / np.abs(values[there])).max()) if there.any() else 0.0
+        with np.errstate(divide="ignore"):  # no error but 0 is a share of 0
+            return found, float((error[there] / np.abs(values[there])).max()) if there.any() else 0.0
 
     if how.precision is None:
         (found, said, control), _ = judge(draw(None, how.runs, 0), [(how.runs, 0)])
@@ -274,10 +275,9 @@ def sampled(
     numbers = len(links.link) * system.steps * system.agents
     most = min(MOST_NUMBERS // numbers, MOST_HELD // numbers // system.dimension**2)
     limit = None if how.at_most is None else seconds(how.at_most)
-    (found, said, control), reached = sampled_to(
-        share(how.precision), limit, most, size_of_block(system.agents), draw, judge
-    )
-    meta = {"control": control._asdict(), "precision": {"asked": reached.asked, "reached": reached.reached}}
+    block = size_of_block(system.agents)
+    (found, said, control), reached = sampled_to(share(how.precision), limit, most, block, draw, judge)
+    meta = {"control": control._asdict(), "precision": reached.for_programs}
     told = f"precision {100 * reached.reached:.2g} % of each value after {found.runs:,} runs"
     told += f", {100 * reached.asked:.3g} % asked for: {reached.stopped}" if reached.stopped else ""
     return found, tuple(filter(None, (told, said, *rare(system, links, found)))), meta

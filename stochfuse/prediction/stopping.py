@@ -47,6 +47,11 @@ class Reached(NamedTuple):
     reached: float
     stopped: str = ""
 
+    @property
+    def for_programs(self) -> dict[str, float | None]:
+        """What was asked and what was reached; None where an error is no share of a value, which is 0."""
+        return {"asked": self.asked, "reached": self.reached if isfinite(self.reached) else None}
+
 
 class _Drawing:
     """A sample that grows by parts, as long as there is time.

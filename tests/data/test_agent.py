@@ -483,5 +483,7 @@ def test_a_rule_of_ones_own_is_alive():
 def test_a_rule_that_returns_rubbish_is_named_by_a_live_agent():
     one, other = both(Halves)
     other.receive(one.message())
-    with pytest.raises(sf.UsageError, match="estimator tests.data.test_agent:Halves: step 1, agent 2: expected a fused P"):
+    with pytest.raises(
+        sf.UsageError, match="estimator tests.data.test_agent:Halves: step 1, agent 2: expected a fused P"
+    ):
         other.fuse()
