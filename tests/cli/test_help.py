@@ -128,7 +128,7 @@ def test_doctor_says_what_is_missing_and_how_to_get_it(monkeypatch):
     from stochfuse.cli import doctor
 
     have = doctor._version
-    monkeypatch.setattr(doctor, "_version", lambda name: None if name == "matplotlib" else have(name))
+    monkeypatch.setattr(doctor, "_version", lambda name: None if name == "matplotlib" else have(name) or "1.0")
     out = run("doctor").stdout
     assert "pip install 'stochfuse[plot]'" in out
     assert sf.__version__ in out
