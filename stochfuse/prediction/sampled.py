@@ -18,7 +18,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -255,6 +255,7 @@ def sampled(
     permutations = relabellings(network, links, kinds)
     groups = groups_alike(network, links, kinds, permutations)
     odds = _odds(system, links, groups, how.estimator)
+    known = cache(lambda: expectation(system, links))  # the same at every stage of a sample that grows
 
     def draw(before: Sample | None, runs: int, first: int) -> Sample:
         now = replace(how, runs=runs)
@@ -263,7 +264,7 @@ def sampled(
         return _extended(before, _drawn(system, links, now, permutations, first=first, errors=errors))
 
     def judge(drawn: Sample, parts: Parts) -> tuple[tuple[Sampled, str, Reduced], float]:
-        found = helped(system, links, how, Sampled(drawn, groups, odds), parts, shown)
+        found = helped(system, links, how, Sampled(drawn, groups, odds), parts, shown, known)
         values, error = found[0].shown(system, shown)
         there = error > 0
         with np.errstate(divide="ignore"):  # no error but 0 is a share of 0
@@ -299,14 +300,20 @@ class Reduced(NamedTuple):
 
 
 def helped(
-    system: System, links: LinkRows, how: Settings, plain: Sampled, parts: Parts, shown: Shown
+    system: System,
+    links: LinkRows,
+    how: Settings,
+    plain: Sampled,
+    parts: Parts,
+    shown: Shown,
+    known: Callable[[], Expected | None],
 ) -> tuple[Sampled, str, Reduced]:
-    """Correct a sample by the optimum where that helps; also what to say of it."""
+    """Correct a sample by the optimum, of `known` expectation, where that helps; also what to say of it."""
     how = replace(how, runs=plain.runs)
     why = no_control(system, links, how)
     if why is not None or not plain.odds.any():
         return plain, f"control: none; {why}" if why else "", Reduced()
-    runs, expected = optimum_of(system, links, how, parts), expectation(system, links)
+    runs, expected = optimum_of(system, links, how, parts), known()
     # of an unknown expectation as if it were the sample's mean, to see whether further runs are worth their time
     own = Expected(runs.map(lambda m: m.mean(axis=1)), np.zeros(plain.odds.shape[:2]))
     found = replace(plain, control=Control(runs, expected or own))
@@ -320,10 +327,10 @@ def helped(
     if reduction < WORTH or expected is None:
         why = f"the exact optimum takes away too little of the variance (1/{reduction:.2f})"
         return plain, f"control: none; {why}", Reduced()
-    known = "exact" if expected.further is None else "estimated"
-    by = "" if known == "exact" else f"; its mean from {expected.runs:.3g} times as many runs of its own"
+    mean = "exact" if expected.further is None else "estimated"
+    by = "" if mean == "exact" else f"; its mean from {expected.runs:.3g} times as many runs of its own"
     told = f"1/{float(f'{reduction:.3g}'):,g}" if reduction < 1e6 else "less than a millionth"
-    return found, f"control: {KIND}; variance {told}{by}", Reduced(KIND, min(reduction, MOST_REDUCED), known)
+    return found, f"control: {KIND}; variance {told}{by}", Reduced(KIND, min(reduction, MOST_REDUCED), mean)
 
 
 def _reduction(plain: Sampled, found: Sampled, system: System, shown: Shown) -> float:
