@@ -24,11 +24,11 @@ from stochfuse.data.cells import Cell, Judged, of_means, of_runs
 from stochfuse.data.columns import Labels
 from stochfuse.data.expected import Family, families_of, knows
 from stochfuse.data.results import Observed, ResultsError, SimulatorResults, read_results
-from stochfuse.data.together import Block, blocks_of, together
+from stochfuse.data.together import LinkCells, blocks_of, together
 from stochfuse.errors import StochfuseError, UsageError, nearest
 from stochfuse.kalman.metrics import Metric
 from stochfuse.kalman.metrics import metric as metric_of
-from stochfuse.prediction.method import Shown
+from stochfuse.prediction.method import ShownPart
 from stochfuse.prediction.predict import predict
 from stochfuse.prediction.result import Prediction
 from stochfuse.scenario.network import LinkRows, stacked_rows
@@ -73,7 +73,7 @@ class Verdict(Result):
     results: SimulatorResults
     prediction: Prediction
     metric: Metric
-    blocks: tuple[Block, ...] = ()
+    blocks: tuple[LinkCells, ...] = ()
     evidence: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     causes: tuple[Cause, ...] = ()
@@ -84,7 +84,6 @@ def crosscheck(
     scenario: ScenarioLike = "thesis-transient",
     *,
     method: str | None = None,
-    estimator: str | None = None,
     metric: str | None = None,
     alpha: float = ALPHA,
     columns: Mapping[str, str] | None = None,
@@ -100,13 +99,13 @@ def crosscheck(
     scenario : what is simulated: from `load_scenario`, a preset's name, a path, or a mapping.
     method : how to average over what arrives, as for `predict`; default: the exact engine that takes estimator and
         scenario, else sampling.
-    estimator : what the simulated agents do with what arrives; default: the scenario's, else local-fusion-graph.
     metric : what columns are of that do not say it; default: the scenario's, else trace.
     alpha : probability that a right simulator is called wrong.
     columns : names that the file has for columns, by those of `read_results`.
     link : link probability, for results without a column of it.
     causes : whether to look for what would explain a disagreement, which takes some seconds.
-    **settings : as for `predict`.
+    **settings : as for `predict`; estimator is what the simulated agents do with what arrives, by default the
+        scenario's, else local-fusion-graph.
 
     Returns
     -------
@@ -145,14 +144,15 @@ def crosscheck(
     given = given.until(last)
     chosen = metric_of(metric or given.metric or "trace", given.model)
     rows, said = rows_of(read, given, link)
-    settings = {"shown": Shown(metrics=(chosen,), agent="worst"), **settings}
-    prediction, unknown = _predicted(read, given, rows, method, {"estimator": estimator, **settings})
+    asked_for = settings.get("estimator")
+    settings = {"shown": ShownPart(metrics=(chosen,), agent="worst"), **settings}
+    prediction, unknown = _predicted(read, given, rows, method, settings)
     read = replace(read, observed=tuple(o for o in read.observed if o.column not in unknown))
     said += [f"column {name} is not compared: {why}" for name, why in unknown.items()]
     again = None
     unsaid = [f for f in _families(read, prediction, chosen)[0] if not knows(prediction, f)]
     if unsaid:
-        whose = prediction.estimator if prediction.estimator != BROADCAST_PRIOR else estimator or given.estimator or LFG
+        whose = prediction.estimator if prediction.estimator != BROADCAST_PRIOR else asked_for or given.estimator or LFG
         kept = ("runs", "seed", "workers", "criterion", "control", "precision", "at_most", "shown")
         asked = {name: settings[name] for name in kept if name in settings}
         again = predict(given, rows, MONTE_CARLO, "actual", estimator=whose, exact_first=False, **asked)
@@ -183,7 +183,7 @@ def _predicted(
         if not errors or set(errors) != {"error"} or len(results.observed) == 1:
             raise
         return predict(free, rows, method, "claimed", **given), {"error": str(error)}
-    if settings["estimator"] is None and found.method == GENERAL:
+    if settings.get("estimator") is None and found.method == GENERAL:
         # nobody asked for another engine
         found = replace(found, notes=tuple(note for note in found.notes if not note.endswith(f"--method {GENERAL}")))
     return found, {}

@@ -54,18 +54,6 @@ class Exchange(Protocol):
         ...
 
 
-class AdditiveExchange(Exchange, Protocol):
-    """The exchange of an additive estimator."""
-
-    def union(self, heard: int) -> int:
-        """Value of what would be fused from the agents heard, whoever hears them (no message under way)."""
-        ...
-
-    def common(self, clauses: Sequence[int]) -> int | None:
-        """Value of what agents with those heard sets have in common, None if the estimator removes nothing."""
-        ...
-
-
 class Estimator(Protocol):
     """What the agents do with what arrives.
 
@@ -125,7 +113,7 @@ class Claims(Protocol):
         ...
 
 
-class Arrivals(NamedTuple):
+class StepOutcomes(NamedTuple):
     """What becomes of a step in many outcomes.
 
     Parameters
@@ -150,7 +138,7 @@ class Together(Protocol):
     @property
     def size(self) -> int: ...
 
-    def exchange(self, now: Arrivals) -> tuple[Any, np.ndarray]:
+    def exchange(self, now: StepOutcomes) -> tuple[Any, np.ndarray]:
         """Estimates (or `Moments`) after the next step's exchange, and which of them each agent has, (runs, agents)."""
         ...
 

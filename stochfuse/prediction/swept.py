@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -56,18 +56,34 @@ def of_parts(over: Over, parts: Sequence[T], read: Callable[[T], Answer]) -> lis
     return found
 
 
+class PointRows(Protocol):
+    """What points have in common that can be read below each other: link, cases, steps and whether agents are alike."""
+
+    @property
+    def link(self) -> np.ndarray: ...
+    @property
+    def cases(self) -> tuple[str, ...] | None: ...
+    @property
+    def steps(self) -> np.ndarray: ...
+    @property
+    def alike(self) -> bool: ...
+
+
+Part = TypeVar("Part", bound=PointRows)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Swept(Result):
-    """Predictions against the values of one or two keys of the scenario.
+class SweptRows(Result, Generic[Part]):
+    """Results against the values of one or two keys of the scenario; rows are theirs, links running fastest.
 
     Parameters
     ----------
     over : the keys and their values, and the scenario of every point.
-    parts : predictions of the points in order, or a single one of all of them.
+    parts : results of the points in order, or a single one of all of them.
     """
 
     over: Over
-    parts: tuple[Prediction, ...]
+    parts: tuple[Part, ...]
 
     @property
     def point(self) -> np.ndarray:
@@ -98,6 +114,16 @@ class Swept(Result):
     def scenario(self) -> Scenario:
         """The first point's scenario."""
         return self.over.scenarios[0]
+
+    @property
+    def alike(self) -> bool:
+        """Whether all agents have the same at every point."""
+        return all(part.alike for part in self.parts)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Swept(SweptRows[Prediction]):
+    """Predictions against the values of one or two keys of the scenario; see `SweptRows`."""
 
     @property
     def quantity(self) -> str:
@@ -149,11 +175,6 @@ class Swept(Result):
         if all(isinstance(v, list) and len(v) == len(p.link) for v, p in zip(each, self.parts, strict=True)):
             return [row for value in each for row in value or ()]
         return each[0] if all(value == each[0] for value in each) else each
-
-    @property
-    def alike(self) -> bool:
-        """Whether all agents have the same covariance at every point."""
-        return all(part.alike for part in self.parts)
 
     @property
     def with_actual(self) -> bool:

@@ -26,7 +26,7 @@ from stochfuse.engines.events import events
 from stochfuse.errors import UsageError
 from stochfuse.prediction.method import RUNS, SEED
 from stochfuse.prediction.predict import choose, predict
-from stochfuse.prediction.swept import Swept, below_each_other, of_parts
+from stochfuse.prediction.swept import Swept, SweptRows, below_each_other, of_parts
 from stochfuse.questions.message_chain import frequencies, like_agents, naive_load, sampled_loads, walked_load
 from stochfuse.scenario.network import LinkRows, require_memoryless
 from stochfuse.scenario.over import Over
@@ -155,39 +155,8 @@ class MessageLoad(Result):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SweptLoad(Result):
-    """Message loads against the values of one or two keys of the scenario; rows are theirs, links running fastest.
-
-    Parameters
-    ----------
-    over : the keys and their values, and the scenario of every point.
-    parts : loads of the points, in order.
-    """
-
-    over: Over
-    parts: tuple[MessageLoad, ...]
-
-    @property
-    def point(self) -> np.ndarray:
-        """(rows,) index of each row's point."""
-        return np.repeat(np.arange(len(self.parts)), [len(part.link) for part in self.parts])
-
-    @property
-    def link(self) -> np.ndarray:
-        """(rows,) link probability of each row, averaged over the links if they differ."""
-        return np.concatenate([part.link for part in self.parts])
-
-    @property
-    def cases(self) -> tuple[str, ...] | None:
-        """A name per row where rows are cases."""
-        if self.parts[0].cases is None:
-            return None
-        return tuple(name for part in self.parts for name in part.cases or ())
-
-    @property
-    def scenario(self) -> Scenario:
-        """The first point's scenario."""
-        return self.over.scenarios[0]
+class SweptLoad(SweptRows[MessageLoad]):
+    """Message loads against the values of one or two keys of the scenario; see `SweptRows`."""
 
     @property
     def rule(self) -> str:
@@ -210,19 +179,9 @@ class SweptLoad(Result):
         return self.parts[0].seed
 
     @property
-    def steps(self) -> np.ndarray:
-        """Steps of the window, of the point that has most of them."""
-        return max((part.steps for part in self.parts), key=len)
-
-    @property
     def sizes(self) -> np.ndarray:
         """Loads that distributions list: 0, 1, 2 …"""
         return max((part.sizes for part in self.parts), key=len)
-
-    @property
-    def alike(self) -> bool:
-        """Whether all agents have the same load at every point."""
-        return all(part.alike for part in self.parts)
 
     def between(self, first: int, last: int) -> SweptLoad:
         """Return the same for steps first … last, of points with fewer up to their last."""

@@ -5,14 +5,14 @@ The [noise] table of a scenario file: noises that hang together and are otherwis
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from stochfuse.kalman.checks import shown
 from stochfuse.scenario.checker import Checker
-from stochfuse.scenario.model import Filter, Model, Noise, Sensor
+from stochfuse.scenario.model import Filter, Model, NoiseCorrelation, Sensor
 from stochfuse.scenario.motion import read_motion, read_step, refuse_keys_of_kinds
 from stochfuse.scenario.network import ARCHITECTURES, Network, mean_delivery, possible_senders
 from stochfuse.scenario.radio import links_between, read_places, read_radio
@@ -47,29 +47,11 @@ def read_network(check: Checker, table: Mapping[str, Any], agent_tables: Sequenc
     scale = _scale(check, table)
     burst = _scaled_burst(_burst(check, "network", table), scale)
     link = _scaled(link, scale) if burst is None else mean_delivery(burst)
-    cases, bursts = [], []
-    given = table.get("case")
-    for i, case in enumerate(given if isinstance(given, list) else [], start=1):
-        if not isinstance(case, dict):
-            continue
-        path = f"network.case[{i}].link"
-        own = link
-        if case.get("link") is not None:
-            own = _scaled(read_link(check, path, case["link"], agents, steps, architecture), scale)
-        bursty = burst if case.get("link") is None else None
-        if case.get("burst") is not None:
-            bursty = _scaled_burst(_burst(check, f"network.case[{i}]", case), scale)
-            own = own if bursty is None else mean_delivery(bursty)
-        given_name = case.get("name", i)
-        name = given_name if isinstance(given_name, str) else str(i)
-        check.name(f"network.case[{i}].name", name)
-        if name in [other for other, _ in cases]:
-            check.note(f"network.case[{i}].name", "a name of its own", shown(name))
-        if own is None and all(where is None for where in (case.get("link"), case.get("burst"), table.get("radio"))):
-            check.note(path, "a link probability here or in network.link", "nothing")
-        elif own is not None:
-            cases.append((name, own))
-            bursts.append(bursty)
+
+    def read(path: str, given: Any) -> np.ndarray | None:
+        return _scaled(read_link(check, path, given, agents, steps, architecture), scale)
+
+    cases, bursts = _cases(check, table, link, burst, scale, read)
     delay, delays = _delays(check, table.get("delay"), agents, architecture)
     if hears is not None and any(b is not None for b in (burst, *bursts)):
         check.note("network.hears", "links without memory (no burst)", "a burst")
@@ -79,10 +61,10 @@ def read_network(check: Checker, table: Mapping[str, Any], agent_tables: Sequenc
         steps=steps,
         architecture=architecture,
         link=link,
-        cases=tuple(cases),
+        cases=cases,
         delay=delay,
         burst=burst,
-        case_bursts=tuple(bursts),
+        case_bursts=bursts,
         hears=hears,
         names=names,
         places=places,
@@ -90,6 +72,41 @@ def read_network(check: Checker, table: Mapping[str, Any], agent_tables: Sequenc
         delays=delays,
         counts=counts,
     )
+
+
+def _cases(
+    check: Checker,
+    table: Mapping[str, Any],
+    link: np.ndarray | None,
+    burst: np.ndarray | None,
+    scale: float | None,
+    read: Callable[[str, Any], np.ndarray | None],
+) -> tuple[tuple[tuple[str, np.ndarray], ...], tuple[np.ndarray | None, ...]]:
+    """Read the alternatives, by name, and their bursts: what one does not say is as in the network."""
+    cases: list[tuple[str, np.ndarray]] = []
+    bursts: list[np.ndarray | None] = []
+    given = table.get("case")
+    for i, case in enumerate(given if isinstance(given, list) else [], start=1):
+        if not isinstance(case, dict):
+            continue
+        path = f"network.case[{i}]"
+        own, bursty = link, burst
+        if case.get("link") is not None:
+            own, bursty = read(f"{path}.link", case["link"]), None
+        if case.get("burst") is not None:
+            bursty = _scaled_burst(_burst(check, path, case), scale)
+            own = own if bursty is None else mean_delivery(bursty)
+        given_name = case.get("name", i)
+        name = given_name if isinstance(given_name, str) else str(i)
+        check.name(f"{path}.name", name)
+        if name in [other for other, _ in cases]:
+            check.note(f"{path}.name", "a name of its own", shown(name))
+        if own is None and all(where is None for where in (case.get("link"), case.get("burst"), table.get("radio"))):
+            check.note(f"{path}.link", "a link probability here or in network.link", "nothing")
+        elif own is not None:
+            cases.append((name, own))
+            bursts.append(bursty)
+    return tuple(cases), tuple(bursts)
 
 
 def _scale(check: Checker, table: Mapping[str, Any]) -> float | None:
@@ -469,7 +486,7 @@ def _own(check: Checker, path: str, value: Any, d: int, steps: int, default: np.
 
 def read_noise(
     check: Checker, table: Mapping[str, Any], sensors: Sequence[Sensor], filters: Sequence[Filter], own: bool
-) -> tuple[Noise | None, np.ndarray | None]:
+) -> tuple[NoiseCorrelation | None, np.ndarray | None]:
     """Read [noise]: measurement noises that hang together, and the process noise of all parallel filters."""
     process = None
     if table.get("process") is not None:
@@ -483,7 +500,7 @@ def read_noise(
     sizes = [sensor.H.shape[-2] for sensor in sensors]
     correlation = _correlation(check, table.get("correlation"), sizes)
     disturbance = _disturbance(check, table.get("disturbance"), sizes)
-    return (None if correlation is None else Noise(correlation, disturbance)), process
+    return (None if correlation is None else NoiseCorrelation(correlation, disturbance)), process
 
 
 def _check_blocks(check: Checker, process: np.ndarray, own: Sequence[np.ndarray]) -> None:

@@ -379,8 +379,9 @@ def test_a_full_or_closed_standard_output_is_a_failure_in_one_line(command):
             env=ENV,
         )
         assert done.returncode == 1
-        assert done.stderr.count("\n") == 1
-        assert "standard output" in done.stderr
+        # A busy machine may have shown progress first.
+        (line,) = (line for line in done.stderr.splitlines() if not line.startswith("note: working"))
+        assert "standard output" in line
 
 
 def test_a_closed_pipe_is_quiet():
