@@ -11,6 +11,7 @@ from stochfuse.cli.options import (
     NETWORK,
     OUTPUT,
     SCENARIO,
+    SHOWN,
     ArchitectureName,
     OutputOption,
     choice,
@@ -24,9 +25,10 @@ from stochfuse.scenario.registry import GENERAL, LFG, NAIVE, OPTIMAL, SIMPLIFIED
 FORMULATIONS = (SIMPLIFIED, GENERAL, NAIVE, OPTIMAL)
 TEXT, LATEX, JSON = FORMATS = ("text", "latex", "json")
 CORRELATIONS = ("independent", "shared")
+QUANTITIES = ("claimed", "actual", "rms")
 EXAMPLES = (
     "stochfuse derive simplified --agents 3 --step 2",
-    "stochfuse derive general --agents 2 --step 2 --q 25 --r 100 --p0 100 --latex",
+    "stochfuse derive general --agents 2 --step 2 --q 25 --r 100 --p0 100 --quantity rms --latex",
 )
 Number = Annotated[str | None, option("A number, exact as typed; left out, a symbol.", SCENARIO, metavar="X")]
 
@@ -51,6 +53,13 @@ def derive(
     correlation: Annotated[
         str, choice(CORRELATIONS, f"Initial estimates: {' or '.join(CORRELATIONS)}; default: independent.", SCENARIO)
     ] = "independent",
+    quantity: Annotated[
+        str | None,
+        choice(QUANTITIES, "Of general and naive: claimed, actual, or rms of the error; default: claimed.", SHOWN),
+    ] = None,
+    initial_error: Annotated[
+        str | None, option("Known error of all initial estimates, for rms; left out, b.", SCENARIO, metavar="X")
+    ] = None,
     latex: Annotated[bool, option("The same as --format latex.", OUTPUT, "--latex")] = False,
     format: Annotated[
         str | None,
@@ -73,6 +82,8 @@ def derive(
     """
     from stochfuse.report.table import check_writable, terminal_width, to_json, write_text
 
+    if formulation in (SIMPLIFIED, OPTIMAL) and (quantity not in (None, "claimed") or initial_error is not None):
+        raise UsageError(f"--quantity and --initial-error: expected formulation general or naive, got {formulation}")
     if latex and format not in (None, LATEX):
         raise UsageError("--latex and --format: expected one of them, got both")
     check_writable(output)
@@ -91,8 +102,18 @@ def derive(
         from stochfuse.symbolic.general import derive_general
 
         estimator = NAIVE if formulation == NAIVE else LFG
-        start = correlation
-        form = derive_general(agents, step, q, r, p0, architecture=architecture, correlation=start, estimator=estimator)
+        form = derive_general(
+            agents,
+            step,
+            q,
+            r,
+            p0,
+            architecture=architecture,
+            correlation=correlation,
+            estimator=estimator,
+            quantity=quantity or QUANTITIES[0],
+            initial_error=initial_error,
+        )
     made = derivation.derivation(form)
     if latex or format == LATEX:
         text = derivation.to_latex(made)

@@ -373,7 +373,8 @@ def evaluate_exactly(ledger: Ledger, sources: Sources) -> list[Information]:
     values: dict[int, Information] = {}
     by_step = sorted(range(len(ledger.sums)), key=ledger.step.__getitem__)
     for value in by_step:
-        total: Any = 0
+        y: Any = None if sources.records is None else 0
+        Y: Any = 0
         for atom, times in ledger.sums[value]:
             if atom not in atoms:
                 kind, step, of = ledger.atoms[atom]
@@ -383,8 +384,9 @@ def evaluate_exactly(ledger: Ledger, sources: Sources) -> list[Information]:
                     PRIOR: lambda step=step, of=of: sources.forward(values[of], step),
                 }
                 atoms[atom] = make[kind]()
-            total = atoms[atom].Y * times + total
-        values[value] = Information(None, total)
+            Y = atoms[atom].Y * times + Y
+            y = None if y is None else atoms[atom].y * times + y
+        values[value] = Information(y, Y)
     return [values[value] for value in range(len(ledger.sums))]
 
 

@@ -9,7 +9,7 @@ import sympy
 
 from stochfuse import __version__
 from stochfuse.scenario.registry import GENERAL, LFG, NAIVE, OPTIMAL, SIMPLIFIED
-from stochfuse.symbolic.general import GeneralForm
+from stochfuse.symbolic.general import CLAIMED, RMS, GeneralForm
 from stochfuse.symbolic.simplified import FIXED, MOST_AGENTS_CLEARED, MU, SimplifiedForm
 
 SCHEMA = "stochfuse.derivation/1"
@@ -46,7 +46,7 @@ def derivation(form: SimplifiedForm | GeneralForm) -> Derivation:
     method = _METHODS[form.estimator] if isinstance(form, GeneralForm) else SIMPLIFIED
     facts = {
         "method": method,
-        "quantity": OPTIMAL if method == OPTIMAL else "claimed",
+        "quantity": OPTIMAL if method == OPTIMAL else getattr(form, "quantity", CLAIMED),
         "agents": form.agents,
         "step": form.step,
         "symbols": ["mu", *map(str, form.symbols)],
@@ -77,30 +77,38 @@ def _simplified_title(form: SimplifiedForm) -> str:
 def _general_title(form: GeneralForm) -> str:
     start = "shared" if form.shared else "independent"
     rule = "naive fusion (42)/(43)" if form.estimator == NAIVE else "the Local Fusion Graph"
-    what, quantity, exact = f"General formulation (49) of {rule}", "claimed", "every outcome"
+    what, exact = f"General formulation (49) of {rule}", "every outcome"
+    quantity = f"{form.quantity} posterior covariance P_k"
     if form.estimator == OPTIMAL:
-        what, quantity, exact = "Contact chain", OPTIMAL, "every path; the best that linear fusion can do"
+        what, exact = "Contact chain", "every path; the best that linear fusion can do"
+        quantity = f"{OPTIMAL} posterior covariance P_k"
+    elif form.quantity == RMS:
+        quantity = "squared posterior error M_k (noise, and the bias from the initial error b)"
     return (
         f"{what}, {_agents(form.agents)}, {form.architecture}, scalar state with F = G = H = 1, {start} initial "
-        f"estimates: expected {quantity} posterior covariance P_k after step k (exact: {exact}). {_SYMBOLS}"
+        f"estimates: expected {quantity} after step k (exact: {exact}). {_SYMBOLS}"
     )
 
 
 def _general_formulas(form: GeneralForm) -> list[Formula]:
-    k = form.step
-    P_k, derivative = sympy.Symbol(f"P_{k}"), sympy.Symbol(f"dP_{k}_dmu")
-    says = f"P_{k} as a polynomial in mu"
+    k, letter = form.step, "M" if form.quantity == RMS else "P"
+    P_k, derivative = sympy.Symbol(f"{letter}_{k}"), sympy.Symbol(f"d{letter}_{k}_dmu")
+    says = f"{P_k} as a polynomial in mu"
     if form.symbols:
-        reached = "reached" if form.estimator == OPTIMAL else "claimed"
-        says = f"P_{k}: every covariance that can be {reached}, times the probability that it is, a polynomial in mu"
+        what = "squared error that can be made" if form.quantity == RMS else "covariance that can be claimed"
+        what = what.replace("claimed", "reached") if form.estimator == OPTIMAL or form.quantity != CLAIMED else what
+        says = f"{P_k}: every {what}, times the probability that it is, a polynomial in mu"
     lines = [
         Formula("closed", says, P_k, form.closed()),
-        Formula("derivative", f"derivative of P_{k} in mu", derivative, form.derivative()),
+        Formula("derivative", f"derivative of {P_k} in mu", derivative, form.derivative()),
     ]
+    if form.quantity == RMS:
+        root = sympy.sqrt(sympy.Symbol(f"M_{k}", positive=True))
+        lines.append(Formula("rms", "root-mean-square error", sympy.Symbol(f"RMS_{k}"), root))
     if not form.symbols:
         L = len(form.bernstein) - 1
         for c, A in enumerate(form.bernstein):
-            text = f"sum of P_{k} over the outcomes in which exactly {c} of {L} messages arrive"
+            text = f"sum of {P_k} over the outcomes in which exactly {c} of {L} messages arrive"
             lines.append(Formula(f"A_{c}", text, sympy.Symbol(f"A_{c}"), A))
     return lines
 
@@ -175,8 +183,9 @@ def to_mapping(made: Derivation) -> dict[str, Any]:
 
 
 def _latex_names(step: int) -> dict[str, str]:
-    derivative = {f"dP_{step}_dmu": rf"\frac{{\mathrm{{d}}P({step})}}{{\mathrm{{d}}\mu}}"}
-    return {f"P_{k}": f"P({k})" for k in range(1, step + 1)} | derivative
+    names = {f"{letter}_{k}": f"{letter}({k})" for letter in "PM" for k in range(1, step + 1)}
+    names |= {f"d{letter}_{step}_dmu": rf"\frac{{\mathrm{{d}}{letter}({step})}}{{\mathrm{{d}}\mu}}" for letter in "PM"}
+    return names | {f"RMS_{step}": rf"\mathrm{{RMS}}({step})"}
 
 
 def _latex_prior(key: str) -> str:

@@ -7,12 +7,16 @@ symbols, or over the rational numbers.  The result is a sum over the different c
     E[P(k)](µ) = Σ_v w_v(µ) P_v,      w_v(µ) = Σ_c a_c µ^c (1−µ)^(L−c),
 
 with whole-number outcome counts behind every a_c: a polynomial in µ whose coefficients are rational functions.
+
+Of the actual error the covariance in each outcome is Σ_s c_s² σ_s², over the initial errors, the process noise of every
+step and the measurement noises, c_s the estimate that a unit of s alone leads to.  A known initial error b, common to
+all agents, leads to c_b b, and the mean squared error is the sum of both; the RMS error is the root of its expectation.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -29,8 +33,11 @@ from stochfuse.kalman.algebra import FIELD
 from stochfuse.prediction.general import check_size
 from stochfuse.scenario.model import Model, Sensor
 from stochfuse.scenario.network import Network, uniform_rows
-from stochfuse.scenario.registry import LFG
+from stochfuse.scenario.registry import LFG, OPTIMAL
 from stochfuse.symbolic.simplified import MU, P0, Q, R, exact_number
+
+B = sympy.Symbol("b", real=True)
+CLAIMED, ACTUAL, RMS = QUANTITIES = ("claimed", "actual", "rms")
 
 MOST_OUTCOMES = 2_000_000
 """Outcomes of the last exchanges, over all graphs, up to which they are gone through one by one."""
@@ -49,6 +56,8 @@ class GeneralForm:
     q, r, p0 : variances: SymPy numbers (exact) or the symbols.
     shared : whether all agents start from one common estimate.
     estimator : "local-fusion-graph" or "naive".
+    quantity : "claimed", "actual" (covariance of the error), or "rms": the mean squared error.
+    error : known initial error b of all agents, for "rms".
     """
 
     agents: int
@@ -59,11 +68,13 @@ class GeneralForm:
     p0: Any = P0
     shared: bool = False
     estimator: str = LFG
+    quantity: str = CLAIMED
+    error: Any = sympy.S.Zero
 
     @property
     def symbols(self) -> tuple[sympy.Symbol, ...]:
-        """The symbols among q, r and p0."""
-        return tuple(s for s in (self.q, self.r, self.p0) if isinstance(s, sympy.Symbol))
+        """The symbols among q, r, p0 and b."""
+        return tuple(s for s in (self.q, self.r, self.p0, self.error) if isinstance(s, sympy.Symbol))
 
     @cached_property
     def terms(self) -> tuple[tuple[sympy.Poly, sympy.Expr], ...]:
@@ -108,7 +119,7 @@ class GeneralForm:
         return sympy.Add(*(sympy.factor(w.diff(MU).as_expr()) * P for w, P in self.terms), evaluate=False)
 
     def lambdify(self) -> Callable[..., np.ndarray]:
-        """Return E[P(step)] as a NumPy function of µ and of the symbols among q, r and p0, in that order."""
+        """Return E[P(step)] as a NumPy function of µ and of the symbols among q, r, p0 and b, in that order."""
         covariances = sympy.lambdify(self.symbols, [P.as_expr() for P, _ in self._counted], modules="numpy", cse=True)
         table = np.array([[float(a) for a in coefficients] for _, coefficients in self._counted])
         degree = table.shape[1] - 1
@@ -128,11 +139,13 @@ class GeneralForm:
         """Ledger, weight by number of arrivals of every value claimed at the step, and number of links L."""
         network = Network(self.agents, self.step, self.architecture, None)
         check_size(network)
-        rows, labels = uniform_rows([0.5]), (0,) * self.agents
-        permutations = relabellings(network, rows, labels)
+        rows, kinds = uniform_rows([0.5]), (0,) * self.agents
+        # footprints only say whose noise is whose
+        labels = kinds if self.quantity == CLAIMED else tuple(range(self.agents))
+        permutations = relabellings(network, rows, kinds)
         drawn = events(network, rows, 1)
         weights = CountWeights(self.step * len(drawn) + 1)
-        ledger = Ledger()
+        ledger = Ledger(None if self.quantity == CLAIMED else kinds)
         estimator = rule_of(self.estimator)(ledger, labels, shared=self.shared, relabellings=permutations)
         groups = tuple(orbits(self.agents, permutations))
         request = Request(self.agents, self.step, lambda _: drawn, weights, groups, most=20_000)
@@ -157,7 +170,7 @@ class GeneralForm:
                     value = ledger.combine(ending.step, [(v, sign) for v, sign in parts if v >= 0])
                     both = _product(_product(_exact(weight), _exact(factor)), [self._share(s) for s in share])
                     known = found.setdefault(value, [sympy.S.Zero] * (ending.events + 1))
-                    self._check_number(len(found))
+                    self._check_number(len(found) if self.quantity == CLAIMED else len(found) // self.agents)
                     for c, a in enumerate(_completed(both, ending.events)):
                         known[c] += a
         return ledger, found, ending.events
@@ -182,21 +195,44 @@ class GeneralForm:
         generators = self.symbols or (sympy.Symbol("unused"),)
         made: Any = field(generators, sympy.QQ)
         K, named = made[0], dict(zip(generators, made[1:], strict=True))
-        q, r, p0 = (
-            np.array([[named[v] if v in named else K(sympy.QQ.from_sympy(v))]], dtype=object)
-            for v in (self.q, self.r, self.p0)
+        q, r, p0, b = (
+            named[v] if v in named else K(sympy.QQ.from_sympy(v)) for v in (self.q, self.r, self.p0, self.error)
         )
-        one = np.array([[K.one]], dtype=object)
-        model = Model(one, q, 0 * one, ("x",), ("",))
-        sources = Sources(model, [Sensor(one, r)], [Information(None, one / p0[0, 0])], algebra=FIELD)
+        sources, squares = self._sources(K.one, q, r, p0, b)
         values = evaluate_exactly(ledger, sources)
         counted: dict[Any, list[Any]] = {}
         for value, coefficients in found.items():
-            P = 1 / values[value].Y[0, 0]
+            y, Y = values[value]
+            P = 1 / Y[0, 0]
+            if y is not None:
+                P = sum((s * (P * c) ** 2 for s, c in zip(squares, y[0], strict=True)), 0 * P)
             known = counted.get(P)
             counted[P] = coefficients if known is None else [a + b for a, b in zip(known, coefficients, strict=True)]
+        self._check_number(len(counted))
         likely = {P: sympy.Add(*coefficients) / sympy.Integer(2) ** degree for P, coefficients in counted.items()}
         return sorted(counted.items(), key=lambda item: (-likely[item[0]], str(item[0])))
+
+    def _sources(self, one: Any, q: Any, r: Any, p0: Any, b: Any) -> tuple[Sources, list[Any]]:
+        """What the ledger's atoms stand for; of errors a unit of each noise in a column, with the noises' variances."""
+        unit = np.array([[one]], dtype=object)
+        model = Model(unit, q * unit, 0 * unit, ("x",), ("",))
+        if self.quantity == CLAIMED:
+            return Sources(model, [Sensor(unit, r * unit)], [Information(None, unit / p0)], algebra=FIELD), []
+        n, steps = self.agents, range(1, self.step + 1)
+        squares = [b**2 if self.quantity == RMS else 0 * one]
+        count = 1 + (1 if self.shared else n) + self.step * (1 + n)
+
+        def column(square: Any) -> np.ndarray:
+            squares.append(square)
+            return np.array([[one if c == len(squares) - 1 else 0 * one for c in range(count)]], dtype=object)
+
+        common = np.array([[one, *[0 * one] * (count - 1)]], dtype=object)
+        first = [column(p0) for _ in range(1 if self.shared else n)]
+        starts = [Information((common + first[0 if self.shared else i]) / p0, unit / p0) for i in range(n)]
+        # the last start is the one that agents have in common
+        model = replace(model, Bu=np.stack([column(q) for _ in steps]))
+        records = [[column(r) for _ in range(n)] for _ in steps]
+        return Sources(model, [Sensor(unit, r * unit)] * n, starts, records, algebra=FIELD), squares
 
 
 def derive_general(
@@ -209,6 +245,8 @@ def derive_general(
     architecture: str = "ad-hoc",
     correlation: str = "independent",
     estimator: str = LFG,
+    quantity: str = CLAIMED,
+    initial_error: Any = None,
 ) -> GeneralForm:
     """Return (49) as formulas, for like agents with a scalar state.
 
@@ -219,6 +257,9 @@ def derive_general(
     architecture : "ad-hoc", "broadcast" or "cyclic".
     correlation : "independent" or "shared" initial estimates.
     estimator : "local-fusion-graph", "naive" or "optimal".
+    quantity : "claimed"; "actual", the covariance of the error; or "rms", of which the form is the mean squared error:
+        actual and the square of the bias from the initial error.  The optimum's actual is what it claims.
+    initial_error : known error b of all initial estimates, for "rms": a number or its text, or None for a symbol.
 
     Returns
     -------
@@ -238,11 +279,26 @@ def derive_general(
     for name, value in (("agents", agents), ("step", step)):
         if value < 1:
             raise UsageError(f"{name}: expected at least 1, got {value}")
+    if quantity not in QUANTITIES:
+        raise UsageError(f"quantity: expected one of {', '.join(QUANTITIES)}, got '{quantity}'")
+    if quantity != CLAIMED and estimator == OPTIMAL:
+        raise UsageError(f"quantity {quantity}: expected formulation general or naive, got optimal")
+    if quantity != RMS and initial_error is not None:
+        raise UsageError(f"initial_error: expected quantity rms, got {quantity}")
     numbers = [exact_number(n, v, s) for n, v, s in (("q", q, Q), ("r", r, R), ("p0", p0, P0))]
     for name, number in (("r", numbers[1]), ("p0", numbers[2])):
         if number == 0:
             raise UsageError(f"{name}: expected a positive number, got 0")
-    return GeneralForm(agents, step, architecture, *numbers, shared=correlation == "shared", estimator=estimator)
+    return GeneralForm(
+        agents,
+        step,
+        architecture,
+        *numbers,
+        shared=correlation == "shared",
+        estimator=estimator,
+        quantity=quantity,
+        error=exact_number("initial_error", initial_error, B, signed=True) if quantity == RMS else sympy.S.Zero,
+    )
 
 
 def _exact(coefficients: np.ndarray) -> list[sympy.Integer]:

@@ -297,13 +297,13 @@ def derive_simplified(
     return SimplifiedForm(agents, step, *numbers, shared=correlation == "shared")
 
 
-def exact_number(name: str, value: Any, symbol: sympy.Symbol) -> sympy.Expr:
+def exact_number(name: str, value: Any, symbol: sympy.Symbol, *, signed: bool = False) -> sympy.Expr:
     """Return a number exactly as typed, or the symbol for None.
 
     Raises
     ------
     UsageError
-        If it is no number of at least 0.
+        If it is no number, or negative and not signed.
     """
     if value is None:
         return symbol
@@ -313,7 +313,7 @@ def exact_number(name: str, value: Any, symbol: sympy.Symbol) -> sympy.Expr:
         number = sympy.Rational(str(value))
     except (TypeError, ValueError, ZeroDivisionError):
         raise UsageError(f"{name}: expected a number, got '{value}'") from None
-    if not number.is_finite or number < 0:
+    if not number.is_finite or (number < 0 and not signed):
         raise UsageError(f"{name}: expected a number of at least 0, got {value}")
     return number
 

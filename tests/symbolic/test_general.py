@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from fractions import Fraction
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import sympy
 
 import stochfuse as sf
+from stochfuse.errors import UsageError
 from stochfuse.report import derivation
 from stochfuse.symbolic.general import derive_general
 from stochfuse.symbolic.simplified import MU, P0, Q, R
@@ -167,3 +169,80 @@ def test_the_optimum_with_symbols():
         sf.derive_optimal(10, 5, 1, 1, 1).polynomial()
     with pytest.raises(sf.UsageError, match="paths or more, at most 20000"):
         sf.derive_optimal(30, 9, 1, 1, 1).polynomial()
+
+
+def _errors_of_naive(agents: int, steps: int, q: Fraction, r: Fraction, p0: Fraction, b: Fraction) -> list[Fraction]:
+    """Mean squared error of naive fusion by number of arrivals: every outcome, x̂ as weights of noises, by hand."""
+    pairs = [(k, i, j) for k in range(steps) for i in range(agents) for j in range(agents) if i != j]
+    variances = {"b": b * b} | {("x", i): p0 for i in range(agents)}
+    total = [Fraction(0)] * (len(pairs) + 1)
+    for arrives in itertools.product((0, 1), repeat=len(pairs)):
+        heard = dict(zip(pairs, arrives, strict=True))
+        state = [({"b": Fraction(1), ("x", i): Fraction(1)}, p0) for i in range(agents)]
+        for k in range(steps):
+            if k:
+                local = []
+                for i, (weights, P) in enumerate(state):
+                    prior = P + q
+                    gain = prior / (prior + r)
+                    moved = {s: (1 - gain) * c for s, c in weights.items()}
+                    moved["w", k] = moved.get(("w", k), Fraction(0)) - (1 - gain)
+                    moved["v", k, i] = gain
+                    variances |= {("w", k): q, ("v", k, i): r}
+                    local.append((moved, (1 - gain) * prior))
+                state = local
+            fused = []
+            for i in range(agents):
+                together = [state[i]] + [state[j] for j in range(agents) if j != i and heard[k, i, j]]
+                P = 1 / sum(1 / other for _, other in together)
+                weights = {}
+                for other, own in together:
+                    for s, c in other.items():
+                        weights[s] = weights.get(s, Fraction(0)) + P / own * c
+                fused.append((weights, P))
+            state = fused
+        total[sum(arrives)] += sum(variances[s] * c * c for weights, _ in state for s, c in weights.items()) / agents
+    return total
+
+
+def test_the_squared_error_of_naive_fusion_is_that_of_every_outcome_by_hand():
+    numbers = [Fraction(7), Fraction(90), Fraction(130)]
+    form = sf.derive_general(2, 3, *map(str, numbers), estimator="naive", quantity="rms", initial_error="-15/2")
+    expected = _errors_of_naive(2, 3, *numbers, Fraction(-15, 2))
+    assert list(form.bernstein) == [sympy.Rational(a.numerator, a.denominator) for a in expected]
+
+
+@pytest.mark.parametrize("start", ["independent", "shared"])
+@pytest.mark.parametrize("architecture", ["ad-hoc", "cyclic"])
+@pytest.mark.parametrize("quantity", ["actual", "rms"])
+def test_errors_as_formulas_are_those_that_are_predicted(quantity, architecture, start):
+    scenario = sf.load_scenario(
+        {
+            "model": {"F": 1.0, "H": 1.0, "Q": 7.0, "R": 90.0},
+            "initial": {"P": 130.0, "correlation": start, "error": -10.0},
+            "network": {"agents": 3, "steps": 2, "architecture": architecture},
+        }
+    )
+    error = {"initial_error": -10} if quantity == "rms" else {}
+    how = {"architecture": architecture, "correlation": start, "quantity": quantity} | error
+    found = float(sf.derive_general(3, 2, 7, 90, 130, **how).polynomial().eval(0.3))
+    predicted = sf.predict(scenario, [0.3], "general", quantity).values()[0, -1]
+    assert (found if quantity == "actual" else found**0.5) == pytest.approx(predicted, rel=1e-12)
+
+
+def test_symbols_of_the_squared_error_are_put_in_by_their_order():
+    form = sf.derive_general(2, 2, r=100, quantity="rms")
+    assert [str(s) for s in form.symbols] == ["q", "p0", "b"]
+    numbers = sf.derive_general(2, 2, 25, 100, 64, quantity="rms", initial_error=-3)
+    assert form.lambdify()(0.4, 25, 64, -3) == pytest.approx(float(numbers.polynomial().eval(0.4)), rel=1e-12)
+
+
+def test_what_a_quantity_is_refused_with():
+    with pytest.raises(UsageError, match="quantity: expected one of claimed, actual, rms, got 'bias'"):
+        sf.derive_general(2, 2, quantity="bias")
+    with pytest.raises(UsageError, match="quantity actual: expected formulation general or naive, got optimal"):
+        sf.derive_general(2, 2, estimator="optimal", quantity="actual")
+    with pytest.raises(UsageError, match="initial_error: expected quantity rms, got actual"):
+        sf.derive_general(2, 2, quantity="actual", initial_error=1)
+    with pytest.raises(UsageError, match="initial_error: expected a number, got 'x'"):
+        sf.derive_general(2, 2, quantity="rms", initial_error="x")
