@@ -184,7 +184,7 @@ class Agent:
         step, where = self.now + 1, f"agent {self.number}, step {self.now + 1}"
         if self._last is not None and step > self._last:
             raise UsageError(
-                f"{where}: expected {self._last} steps at most, network.steps, since model or sensors depend on the step"
+                f"{where}: expected {self._last} steps at most (network.steps): model or sensors depend on the step"
             )
         H = at_step(self._setting.world.H[self._setting.agent], step)
         if self._live is None:

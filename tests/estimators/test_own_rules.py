@@ -372,6 +372,13 @@ def test_names_travel_and_are_equal_only_with_one_rule():
         ("nowhere.at_all:Mine", r"got 'nowhere.at_all:Mine' \(ModuleNotFoundError"),
         ("math:Mine", r"got 'math:Mine' \(AttributeError"),
         ("naiv", r"expected one of .*, or package.module:Class, got 'naiv' \(did you mean 'naive'\?\)"),
+        ("mine.Mine", r"or package.module:Class, got 'mine.Mine' \(did you mean 'mine:Mine'\?\)"),
+        ("./mine.py:Mine", r"names and no path of a file, got './mine.py:Mine' \(did you mean 'mine:Mine'\?\)"),
+        ("mine:", r"names and no path of a file, got 'mine:'$"),
+        (
+            rule_of(lambda x: (x[0], 1)),
+            r"estimator mine: expected a method fuse\(self, x, P\), got one called by fuse\(x\)",
+        ),
         (3, r"with a method fuse\(x, P\), got builtins:int, which has none"),
         (type("Needs", (Adds,), {"__init__": lambda self, weight: None}), "made without arguments, or an object of it"),
     ],
