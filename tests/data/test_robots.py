@@ -253,9 +253,11 @@ def test_the_table_and_the_figure(white):
     text = run._repr_html_()
     assert re.search(r"stand-alone</td><td[^>]*>0</td><td[^>]*>0\.\d", text)
     assert re.search(r"0\.0\d+ of range", text)
-    left, right = run.plot().axes
+    left, *robots = run.plot().axes
     assert left.get_xlabel() == "link probability µ"
-    assert len(right.lines) == 2 * 3
+    assert [axes.get_ylabel() for axes in robots] == [f"robot {i} [m]" for i in (1, 2, 3)]
+    alone = np.hypot(*run.alone[:, 1, :2].T)
+    np.testing.assert_allclose(robots[1].lines[0].get_ydata()[-1], alone[-1])
 
 
 def edit(name, change):
