@@ -236,6 +236,24 @@ def test_white_noise_claims_what_it_predicts(white):
     assert white.nees.mean > 1.5 * full.nees.mean
 
 
+def test_claims_make_up_for_noises_that_the_calibration_run_shows_to_be_too_small(record, white):
+    """Noises said to have a ninth of their variance: predicted is a third, the claim what it was but for who was gated."""
+    full = white[1]
+
+    def ninth(channel):
+        parts = {name: getattr(channel, name)._replace(variance=getattr(channel, name).variance / 9)
+                 for name in ("common", "subject")}  # fmt: skip
+        return channel._replace(doubt=channel.doubt / 9, white=channel.white / 9, **parts)
+
+    n = full.noises
+    small = n._replace(**{name: ninth(getattr(n, name)) for name in ("speed", "turn", "range", "bearing")})
+    found = sf.run_robots(record, [0], ["stand-alone"], until=30.0, noises=small).row("stand-alone", 0)
+    known = full.row("stand-alone", 0)
+    assert found.predicted == pytest.approx(known.predicted / 3, rel=0.05)
+    assert known.claimed * 0.8 < found.claimed
+    assert found.nees.mean < 1.5 * max(known.nees.mean, 3.0)
+
+
 def test_json_and_table(folder):
     words = ["run", "utias", "--data", folder, "--until", 30]
     done = command(*words, "--link", "0,1", "--estimator", "lwin", "--format", "json")
