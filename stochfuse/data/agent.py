@@ -101,7 +101,7 @@ class Agent:
         name = estimator_named(estimator or given.estimator or registry.LFG)
         choose("criterion", criterion, registry.CRITERIA)
         self.scenario, self.estimator, self.criterion = given, name, criterion
-        number, start = _number(given, agent), start or Start()
+        number, start = _number(given, agent), Start() if start is None else start
         world = _begun(given, number, start)
         live = Live(given, number, start)
         self._set(MessageProtocol.of(protocol), world, live, number, start)
@@ -137,14 +137,14 @@ class Agent:
         sizes, n = tuple(rows.stop - rows.start for rows in world.states), system.agents
         matrices = 2 if getattr(made, "split", False) else 1
         definite = (entry.sums or entry.weighs) and name != registry.OPTIMAL
-        kind = Kind(name, sizes, matrices, definite, n * 2 * (protocol.horizon + 1))
+        kind = Kind(name, sizes, matrices, definite, n * 2 * (protocol.horizon + 1), _told(world))
         shared = system.shared and start.step == 1 and start.P is None
         self._setting = AgentSetting(world, agent, riding, kind, protocol, shared)
         late = capabilities.reason(name, registry.GENERAL, "delay") is None
         self._knows: Knowledge = knowledge_of(self._setting, Life(agent, 0), start.step, made, late)
-        varies = system.model.varies or any(sensor.varies for sensor in system.sensors)
-        bounded = varies or bool(self.scenario.instruments) or entry.own_filters
-        self._last = system.steps if bounded else None
+        moves = any(f is not None and not f.stands for f in self.scenario.instruments)
+        varies = system.model.varies or moves or any(M.ndim > 2 for M in (*world.H, *world.R))
+        self._last = system.steps if varies or entry.own_filters else None
 
     @property
     def number(self) -> int:
@@ -174,7 +174,7 @@ class Agent:
 
         Parameters
         ----------
-        z : (p,) measurement of the new step, or a number; None if there is none.
+        z : (p,) measurement of the new step, or a number; None, or NaN alone, if there is none.
 
         Raises
         ------
@@ -184,7 +184,7 @@ class Agent:
         step, where = self.now + 1, f"agent {self.number}, step {self.now + 1}"
         if self._last is not None and step > self._last:
             raise UsageError(
-                f"{where}: expected {self._last} steps at most, the scenario's matrices depend on the step"
+                f"{where}: expected {self._last} steps at most (network.steps): model or sensors depend on the step"
             )
         H = at_step(self._setting.world.H[self._setting.agent], step)
         if self._live is None:
@@ -205,13 +205,14 @@ class Agent:
             array = np.asarray(z, dtype=float).reshape(-1, 1)
         except (TypeError, ValueError):
             raise UsageError(f"{where}: expected numbers for z, got {type(z).__name__}") from None
-        if np.isnan(array).all():
+        if array.size and np.isnan(array).all():
             return None
         nonlinear = self._live is not None and self._live.function is not None
         if not H.any() and not nonlinear:
             raise UsageError(f"{where}: expected no z, its sensor measures nothing then")
         if len(array) != len(H) or not np.isfinite(array).all():
-            raise UsageError(f"{where}: expected {len(H)} finite numbers for z, got {array.ravel().tolist()}")
+            expected = f"{len(H)} finite number{'s' if len(H) > 1 else ''} for z, or None"
+            raise UsageError(f"{where}: expected {expected}, got {array.ravel().tolist()}")
         return array
 
     def message(self, to: int | str | Sequence[int | str] | None = None) -> bytes:
@@ -228,7 +229,10 @@ class Agent:
         if to is None:
             hearers = np.flatnonzero(reachable(self.scenario.network)[:, self._setting.agent]).tolist()
         else:
-            hearers = [_number(self.scenario, one) for one in ([to] if isinstance(to, int | str) else to)]
+            hearers = [
+                _number(self.scenario, one)
+                for one in ([to] if isinstance(to, str) or not isinstance(to, Sequence) else to)
+            ]
         return self._knows.message(hearers)
 
     def receive(self, message: bytes) -> bool:
@@ -325,7 +329,11 @@ class Agent:
                 got = "none" if estimator is None else f"'{name}'"
                 raise MessageError(f"saved agent: expected estimator '{facts['estimator']}' to be given, got {got}")
             agent = cls(scenario, facts["agent"], name, protocol=protocol, criterion=criterion)
-            agent._restore(facts, decode(whole[end:], agent._saved_kind()))
+            try:
+                nodes = decode(whole[end:], agent._saved_kind())
+            except MessageError:
+                raise MessageError("saved agent: expected one of this scenario (agents, F, Q), got another's") from None
+            agent._restore(facts, nodes)
         except (KeyError, TypeError, UnicodeDecodeError, json.JSONDecodeError) as error:
             raise MessageError(f"saved agent: expected what Agent.save returned, got other facts: {error}") from None
         return agent
@@ -417,20 +425,35 @@ def _number(scenario: Scenario, agent: int | str) -> int:
     raise UsageError(f"agent: expected a number from 1 to {n}{named}, got '{agent}'")
 
 
+def _told(world: World) -> str:
+    """F and Q of the first agent's first step, to digits that no arithmetic of another machine changes."""
+    F, Q = (M if M.ndim == 2 else M[min(1, len(M) - 1)] for M in (world.F[0], world.Q))
+    rows = world.states[0]
+    return " ".join(f"{value + 0.0:.6e}" for value in (*F.ravel(), *Q[rows, rows].ravel()))
+
+
 def _begun(scenario: Scenario, agent: int, start: Start) -> World:
     """What the filters are told, with the agent's own first estimate."""
     world = world_of(scenario.system)
-    if not start.step >= 1 or (start.x is None) != (start.P is None):
-        raise UsageError("start: expected a step of at least 1, and both x and P or neither")
+    # what stands is linearised anew at every step; along the nominal path it is only for those who have no data
+    still = [f is not None and f.stands for f in scenario.instruments or (None,) * len(world.H)]
+    world = replace(world, H=tuple(H[-1] if one and H.ndim > 2 else H for H, one in zip(world.H, still, strict=True)))
+    counted = isinstance(start, Start) and isinstance(start.step, int | np.integer) and start.step >= 1
+    if not counted or (start.x is None) != (start.P is None):
+        raise UsageError(f"start: expected Start(step of at least 1, and both x and P or neither), got {start!r}")
     if start.P is None:
         return world
     rows = world.states[agent]
-    d, P, x = rows.stop - rows.start, np.asarray(start.P, dtype=float), np.asarray(start.x, dtype=float)
+    d = rows.stop - rows.start
+    try:
+        P, x = np.asarray(start.P, dtype=float), np.asarray(start.x, dtype=float)
+    except (TypeError, ValueError):
+        raise UsageError(f"start: expected numbers for x and P, got {start.x!r} and {start.P!r}") from None
     if P.shape != (d, d) or x.size != d or not np.isfinite(x).all():
         raise UsageError(f"start: expected x of {d} numbers and P of {d}×{d}, got {x.shape} and {P.shape}")
     fault = covariance_fault(P, definite=True)
     if fault is not None:
-        raise UsageError(f"start.P: {fault}")
+        raise UsageError(f"start.P: expected a covariance, got {fault}")
     P0 = world.P0.copy()
     P0[rows, rows] = P
     return replace(world, P0=P0)

@@ -11,7 +11,7 @@ under the old name, for others may have heard what it no longer knows.
 
 **Bytes** (little endian; a varint has 7 bits a byte, low ones first):
 
-    "SF", version, matrices m, CRC-32 of the estimator's name, agents, dimension d, step, number of lives B, of nodes N
+    "SF", version, matrices m, CRC-32 of estimator and model, agents, dimension d, step, number of lives B, of nodes N
     B times    varints: agent, life, latest step T of that life that any node of the message knows
     N times    varints: whose life, T − step, and for every other life T − known (T where nothing is known)
     N times    d + m·d(d+1)/2 numbers of 8 bytes: y and Y, or x and P (and the part of P that is independent)
@@ -87,6 +87,7 @@ class Kind(NamedTuple):
     matrices : of every node.
     definite : whether the first of these must be definite.
     most : nodes that a message may have.
+    model : what all agents must take for true alike, in words.
     """
 
     estimator: str
@@ -94,11 +95,12 @@ class Kind(NamedTuple):
     matrices: int = 1
     definite: bool = True
     most: int = 10_000
+    model: str = ""
 
     @property
     def code(self) -> int:
-        """Number of the estimator."""
-        return zlib.crc32(self.estimator.encode())
+        """Number of the estimator and the model."""
+        return zlib.crc32(f"{self.estimator}{self.model}".encode())
 
 
 @dataclass(frozen=True)
@@ -192,7 +194,8 @@ def decode(data: Any, kind: Kind) -> list[Node]:
     if SUM.unpack_from(data, len(data) - SUM.size)[0] != zlib.crc32(data[: -SUM.size]):
         _refuse("bytes that fit their checksum", "damaged ones")
     if (code, matrices, agents) != (kind.code, kind.matrices, len(kind.dimensions)):
-        _refuse(f"{len(kind.dimensions)} agents with estimator {kind.estimator}", "another network's or estimator's")
+        expected = f"{len(kind.dimensions)} agents with estimator {kind.estimator} and the same F and Q"
+        _refuse(expected, "another network's, model's or estimator's")
     width = d + matrices * d * (d + 1) // 2
     least = HEAD.size + 3 * B + N * (1 + B + 8 * width) + SUM.size
     if not 1 <= N <= kind.most or not 1 <= B <= LIVES * agents or len(data) < least or not d:

@@ -2,7 +2,8 @@
 
     1. `stochfuse.data.robot_errors.identify` on the first `until` seconds, where the truth is used: a calibration run
     2. filters that are told white noises of the same weight over long times, times one factor for each robot, by which
-       the claim is right on average in the calibration run, as predicted (not as realised) for a robot alone
+       the claim is right on average in the calibration run, as predicted for a robot alone, and times one for all (at
+       least 1) by which the NEES realised there exceeds that: it changes what is claimed, and hardly any gain
     3. the filters on the record, `runs` times for each link probability: realised RMS of position, claim, NEES
     4. the errors that they should have, along the path that the robots alone believed in, by other draws of arrivals
 
@@ -28,6 +29,7 @@ from stochfuse.data.robot_filters import (
     ESTIMATORS,
     Assumed,
     Followed,
+    Moment,
     RobotMoments,
     RobotPath,
     assumed,
@@ -213,7 +215,11 @@ def _alone(course_: RobotPath, noises: ChannelNoises, told: Assumed, last: int) 
     """Every robot by itself: the path that it believes in, and by what its claim is to be scaled."""
     record, nobody = course_.record, np.zeros((1, course_.pairs, 2), dtype=bool)
     followed = Followed(course_, 1)
-    path = np.array([followed.x[0].copy() for _ in filtered(course_, "stand-alone", told, nobody, followed)])
+    path, realised = [], []
+    for moment in filtered(course_, "stand-alone", told, nobody, followed):
+        path.append(followed.x[0].copy())
+        realised.append(_errors(followed, record, moment)[1][0])
+    path = np.array(path)
     expected = RobotMoments(course_, noises, path, 1)
     first, n = min(record.step_at(FORGOTTEN), last // 2), len(record.robots)
     deviation, ratio = np.zeros_like(path), np.zeros((record.steps, n))
@@ -223,7 +229,16 @@ def _alone(course_: RobotPath, noises: ChannelNoises, told: Assumed, last: int) 
         ratio[moment.step] = np.trace(np.linalg.solve(moment.claims[0], E[0]), axis1=-2, axis2=-1) / 3.0
     error = path - record.truth
     error[..., 2] = wrapped(error[..., 2])
-    return _Alone(path, error, deviation, np.maximum(ratio[first:last].mean(axis=0), 1e-3))
+    factor = np.maximum(ratio[first:last].mean(axis=0), 1e-3)
+    beyond = float((np.array(realised)[first:last].mean(axis=0) / 3.0 / factor).mean())
+    return _Alone(path, error, deviation, factor * max(beyond, 1.0))
+
+
+def _errors(followed: Followed, record: RobotRecord, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
+    """Errors (items, robots, 3) of what is believed, and their NEES."""
+    e = followed.x - record.truth[moment.step]
+    e[..., 2] = wrapped(e[..., 2])
+    return e, (e[..., None, :] @ np.linalg.solve(moment.claims, e[..., None]))[..., 0, 0]
 
 
 class _Found(NamedTuple):
@@ -239,9 +254,7 @@ def _realised(course_: RobotPath, name: str, told: Assumed, items: _ArrivalDraws
     for moment in filtered(course_, name, told, items.heard, followed):
         if moment.step <= last:
             continue
-        e = followed.x - course_.record.truth[moment.step]
-        e[..., 2] = wrapped(e[..., 2])
-        nees = (e[..., None, :] @ np.linalg.solve(moment.claims, e[..., None]))[..., 0, 0]
+        e, nees = _errors(followed, course_.record, moment)
         found.append((e[..., 0] ** 2 + e[..., 1] ** 2, moment.claims[..., [0, 1], [0, 1]].sum(axis=-1), nees))
     return _Found(*map(np.array, zip(*found, strict=True)))
 

@@ -552,8 +552,9 @@ def _root(shares: np.ndarray, alpha: np.ndarray, delta: np.ndarray, power: int) 
     found, w, low, high = np.full(n, 0.5), np.full(n, 0.5), np.zeros(n), np.ones(n)
     moving = np.arange(n)
     for _ in range(MOST_PAIR_STEPS):
-        ratio = delta / (alpha + w * delta)
-        terms = shares * ratio if power == 1 else shares * ratio * ratio / delta
+        at = alpha + w * delta
+        ratio = delta / at
+        terms = shares * ratio if power == 1 else shares * ratio / at
         slope, bend = -terms.sum(axis=0), power * (terms * ratio).sum(axis=0)
         low, high = np.where(slope < 0, w, low), np.where(slope < 0, high, w)
         new = w - slope / bend

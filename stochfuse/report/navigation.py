@@ -63,13 +63,15 @@ def draw_navigation(found: RunResult, title: Sequence[str], averages: Callable[[
             error, sigma = (x - estimate)[:, k], 2 * np.sqrt(trace.variance[:, agent, POSITION][:, k])
             axes[1, k].fill_between(seconds, -sigma, sigma, color=style["color"], alpha=0.15, linewidth=0)
             axes[1, k].plot(seconds, error, **style)
+            for edge in (-sigma, sigma):  # told apart without colour
+                axes[1, k].plot(seconds, edge, **{**style, "linewidth": 0.6})
         axes[1, k].set_ylabel(f"error {AXES[k]} [m]")
         axes[1, k].set_xlabel("time [s]")
         for each in axes[:, k]:
             each.grid(alpha=0.3)
     below(figure, axes[0, 0].get_legend_handles_labels()[0])
     name = network.names[agent] if network.names else f"agent {agent + 1}"
-    titled(figure, *title, f"{name} in the first run: position, and its error with ±2σ claimed")
+    titled(figure, *title, f"{name} in the first run: position, and its error with ±2σ claimed (thin)")
     return figure
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from stochfuse import __version__
 from stochfuse.data.robot_errors import Channel
 from stochfuse.data.robot_run import RobotRow, RobotRun
-from stochfuse.report.plot import COLORS, figure_class, titled
+from stochfuse.report.plot import COLORS, MARKERS, below, figure_class, titled
 from stochfuse.report.runs import SCHEMA
 from stochfuse.report.table import Report, Table, number, to_csv
 
@@ -123,35 +123,41 @@ def robot_json(found: RobotRun) -> dict[str, Any]:
 
 
 def draw_robots(found: RobotRun) -> Any:
-    """Return the figure: errors over the link probability, and one robot alone with what was predicted of it."""
-    figure = figure_class()(figsize=(10.5, 5.4), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    """Return the figure: errors over the link probability, and each robot alone with what was predicted of it."""
+    robots = found.record.robots
+    figure = figure_class()(figsize=(10.5, 6.4), layout="constrained")
+    grid = figure.add_gridspec(len(robots), 2)
+    left = figure.add_subplot(grid[:, 0])
     names = list(dict.fromkeys(row.estimator for row in found.rows))
     for place, name in enumerate(names):
         rows = [row for row in _means(found) if row.estimator == name]
         link = [row.link for row in rows]
-        color = COLORS[place % len(COLORS)]
-        left.plot(link, [row.predicted for row in rows], color=color, dashes=(4, 2), linewidth=1.3)
-        left.plot(link, [row.realised for row in rows], "o-", color=color, markersize=4, linewidth=1.3, label=name)
+        style = {"color": COLORS[place % len(COLORS)], "marker": MARKERS[place % len(MARKERS)], "linewidth": 1.3}
+        left.plot(link, [row.predicted for row in rows], dashes=(4, 2), markersize=4, markerfacecolor="w", **style)
+        left.plot(link, [row.realised for row in rows], markersize=5, label=name, **style)
     left.set_ylim(bottom=0)
     left.set_xlabel("link probability µ")
     left.set_ylabel("RMS of position [m]")
-    left.set_title("realised (dots), predicted (dashed)", fontsize="small")
+    left.set_title("realised (filled), predicted (dashed)", fontsize="small")
+    left.grid(alpha=0.3)
+    below(figure)
     shown = slice(None, None, max(1, found.record.steps // POINTS))
     seconds = np.arange(found.record.steps)[shown] * found.record.interval
-    for place, robot in enumerate(found.record.robots):
-        distance = np.hypot(*found.alone[shown, place, :2].T)
+    first = None
+    for place, robot in enumerate(robots):
+        right = first = figure.add_subplot(grid[place, 1], sharex=first, sharey=first)
+        right.axvspan(0, found.until, color="0.9", linewidth=0)
+        right.plot(seconds, np.hypot(*found.alone[shown, place, :2].T), color="k", linewidth=1.2)
         deviation = np.hypot(*found.alone_deviation[shown, place, :2].T)
-        color = COLORS[place % len(COLORS)]
-        right.plot(seconds, distance, color=color, linewidth=1.3, label=f"robot {robot}")
-        right.plot(seconds, deviation, color=color, linewidth=1.0, dashes=(4, 2))
-    right.axvspan(0, found.until, color="0.9", linewidth=0)
-    right.set_ylim(bottom=0)
-    right.set_xlabel("time [s]")
-    right.set_ylabel("error of position [m]")
-    right.set_title("robots alone: realised, predicted deviation (dashed); grey: noises identified", fontsize="small")
-    for axes in (left, right):
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize="small", loc="lower left" if axes is left else "upper left")
+        right.plot(seconds, deviation, color=COLORS[0], linewidth=1.2, dashes=(4, 2))
+        right.set_ylabel(f"robot {robot} [m]", fontsize="small")
+        right.tick_params(labelbottom=place == len(robots) - 1)
+        right.grid(alpha=0.3)
+        if not place:
+            title = "robots alone: realised, predicted deviation (dashed); grey: noises identified"
+            right.set_title(title, fontsize="small")
+    if first is not None:
+        first.set_ylim(bottom=0)
+        first.set_xlabel("time [s]")
     titled(figure, *_titles(found)[:2])
     return figure

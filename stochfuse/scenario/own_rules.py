@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from contextlib import contextmanager
 from functools import lru_cache
 from importlib import import_module
+from inspect import signature
 from typing import TYPE_CHECKING, Any
 
 from stochfuse.errors import UsageError, nearest
@@ -104,8 +105,11 @@ def estimator_named(given: Any, *, here: bool = False) -> str:
         return _named(_name_of(given), given)
     if ":" not in given:
         return _named(given, _installed(given))
+    module, _, path = given.partition(":")
+    if module.endswith(".py") or not all(part.isidentifier() for part in f"{module}.{path}".split(".")):
+        hint = nearest(given, (f"{os.path.basename(module).removesuffix('.py')}:{path}",)) if module and path else ""
+        raise UsageError(f"estimator: expected package.module:Class, names and no path of a file, got '{given}'{hint}")
     with _loading(given, here):
-        module, _, path = given.partition(":")
         found: Any = import_module(module)
         for part in path.split("."):
             found = getattr(found, part)
@@ -128,10 +132,10 @@ def _installed(given: str) -> Any:
 
     found = {point.name: point for point in entry_points(group=GROUP)}
     if given not in found:
-        known = (*ESTIMATORS, *found)
+        known, dotted = (*ESTIMATORS, *found), () if given.endswith(".py") else (":".join(given.rsplit(".", 1)),)
         raise UsageError(
             f"estimator: expected one of {', '.join(known)}, or package.module:Class, got '{given}'"
-            f"{nearest(given, known)}"
+            f"{nearest(given, (*known, *dotted) if '.' in given else known)}"
         )
     with _loading(given):
         return found[given].load()
@@ -146,7 +150,18 @@ def _name_of(given: Any) -> str:
 def _named(name: str, given: Any) -> OwnRule:
     if not callable(getattr(given, "fuse", None)):
         raise UsageError(f"estimator: expected one of {', '.join(ESTIMATORS)}, or {WHAT}, got {name}, which has none")
-    return OwnRule(name, _made(given) if isinstance(given, type) else given)
+    rule = _made(given) if isinstance(given, type) else given
+    try:
+        taken = signature(rule.fuse)
+    except (TypeError, ValueError):  # of compiled code, which cannot be looked at
+        return OwnRule(name, rule)
+    try:
+        taken.bind(None, None)
+    except TypeError:
+        raise UsageError(
+            f"estimator {name}: expected a method fuse(self, x, P), got one called by fuse{taken}"
+        ) from None
+    return OwnRule(name, rule)
 
 
 @lru_cache(maxsize=64)

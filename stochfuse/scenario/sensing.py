@@ -255,6 +255,11 @@ class Instrument:
     velocity: np.ndarray
     seen: np.ndarray
 
+    @property
+    def stands(self) -> bool:
+        """Whether it measures at every step, from one place: steps beyond the path's are like those on it."""
+        return not np.ptp(self.place, axis=0).any() and bool(self.seen[1:].all())
+
     def h(self, x: np.ndarray, step: int) -> np.ndarray:
         """What states x (..., d, 1) would show at a step (counted from 1): (..., p, 1)."""
         return observe(self.kind, self._sight(x, step))
@@ -268,7 +273,8 @@ class Instrument:
         return residual(self.kind, measured, expected, self.layout.axes)
 
     def _sight(self, x: np.ndarray, step: int) -> Sight:
-        return _sight(self.layout, x[..., 0], self.place[step - 1], self.velocity[step - 1])
+        now = min(step, len(self.place)) - 1  # later only for one that `stands`
+        return _sight(self.layout, x[..., 0], self.place[now], self.velocity[now])
 
 
 def _sight(layout: Layout, x: np.ndarray, place: np.ndarray, velocity: np.ndarray) -> Sight:

@@ -303,7 +303,7 @@ def test_what_was_heard_before_tells_nothing_and_changes_nothing():
         (lambda m: summed(b"SF\x09" + m[3:-4]), "version 1 of a message, got version 9"),
         (lambda m: b"PK" + m[2:], "got other bytes"),
         (lambda m: m[:-1] + bytes([m[-1] ^ 1]), "got damaged ones"),
-        (lambda m: summed(m[:8] + b"\x04\x00" + m[10:-4]), "another network's or estimator's"),
+        (lambda m: summed(m[:8] + b"\x04\x00" + m[10:-4]), "another network's, model's or estimator's"),
         (lambda m: summed(m[:18] + b"\xff\xff" + m[20:-4]), "nodes that fit into"),
         (lambda m: summed(m[:16] + b"\xff\xff" + m[18:-4]), "nodes that fit into"),
         (lambda m: summed(m[:-12] + struct.pack("<d", np.nan)), "finite numbers"),
@@ -399,12 +399,64 @@ def test_the_reason_of_a_refusal_is_told():
         sf.Agent("thesis-steady", 4)
     with pytest.raises(sf.UsageError, match=r"protocol: expected full, .* got 'window'"):
         sf.Agent("thesis-steady", 1, protocol="window")
-    with pytest.raises(sf.UsageError, match="expected 1 finite numbers for z, got"):
+    with pytest.raises(sf.UsageError, match="expected 1 finite number for z, or None, got"):
         sf.Agent("thesis-steady", 1).step([1.0, 2.0])
+    with pytest.raises(sf.UsageError, match=r"expected 1 finite number for z, or None, got \[\]"):
+        sf.Agent("thesis-steady", 1).step([])
+    with pytest.raises(sf.UsageError, match=r"agent: expected a number from 1 to 3, got '2\.5'"):
+        sf.Agent("thesis-steady", 1).message(to=2.5)
+    for start in (5, sf.Start(2.5), sf.Start(3, [0.0])):
+        with pytest.raises(
+            sf.UsageError, match=r"start: expected Start\(step of at least 1, and both x and P or neither"
+        ):
+            sf.Agent("thesis-steady", 1, start=start)
+    with pytest.raises(sf.UsageError, match=r"start: expected numbers for x and P, got \['a'\] and"):
+        sf.Agent("thesis-steady", 1, start=sf.Start(3, ["a"], [[1.0]]))
+    with pytest.raises(sf.UsageError, match=r"start\.P: expected a covariance, got "):
+        sf.Agent("thesis-steady", 1, start=sf.Start(3, [0.0], [[-1.0]]))
     with pytest.raises(sf.UsageError, match="start: expected x of 1 numbers"):
         sf.Agent("thesis-steady", 1, start=sf.Start(3, [0.0], [[1.0, 0.0], [0.0, 1.0]]))
     with pytest.raises(sf.MessageError, match=r"expected what Agent\.save returned"):
         sf.Agent.load(b"nonsense", "thesis-steady")
+
+
+def test_agents_of_another_model_are_refused_where_all_sizes_agree():
+    here, there = scenario(2), sf.scenario(model={"F": [[1, 1], [0, 1]], "Q": Q, "H": H, "R": R}, initial=P0,
+                                           network={"agents": 2, "steps": 6})  # fmt: skip
+    with pytest.raises(sf.MessageError, match="the same F and Q, got another network's, model's"):
+        sf.Agent(here, 1).receive(sf.Agent(there, 2).message())
+    with pytest.raises(sf.MessageError, match="saved agent: expected one of this scenario"):
+        sf.Agent.load(sf.Agent(there, 1).save(), here)
+    assert sf.Agent(scenario(2, 9), 1).receive(sf.Agent(here, 2).message())  # steps do not matter
+
+
+@pytest.mark.parametrize("kind", ["position", "range-bearing"])
+def test_sensors_that_stand_go_on_beyond_the_scenarios_steps(kind):
+    """As in a scenario that is long enough; a sensor that moves ends with its path."""
+
+    def at(steps, positions=((0, 0), (90, 0))):
+        looks = {"position": {"kind": kind, "sigma": 3}, "range-bearing": {"kind": kind, "sigma": [3, 0.02]}}[kind]
+        return sf.scenario(
+            model={"kind": "constant-velocity", "axes": 2, "noise": 0.1,
+                   "nominal": {"position": [50, 40], "velocity": [2, 1]}},
+            initial=np.diag([25, 1, 25, 1]), network={"agents": 2, "steps": steps},
+            agent=[{"position": list(p), "sensor": looks} for p in positions],
+        )  # fmt: skip
+
+    live = [[sf.Agent(at(steps), i) for i in (1, 2)] for steps in (2, 8)]
+    for k in range(2, 9):
+        for one, two in live:
+            one.step([52.0 + 2 * k, 41.0 + k] if kind == "position" else [60.0 + k, 0.6])
+            two.step()
+            two.receive(one.message())
+            two.fuse()
+    for (x, P), (y, C) in zip(*(map(sf.Agent.fuse, pair) for pair in live), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-9)
+        np.testing.assert_allclose(P, C, rtol=1e-9, atol=1e-12)
+    moving = sf.Agent(at(2, ([[0, 0], [1, 0]], (90, 0))), 1)
+    moving.step()
+    with pytest.raises(sf.UsageError, match=r"step 3: expected 2 steps at most \(network\.steps\): model or sensors"):
+        moving.step()
 
 
 def test_who_joins_late_is_an_independent_source():

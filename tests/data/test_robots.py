@@ -236,6 +236,24 @@ def test_white_noise_claims_what_it_predicts(white):
     assert white.nees.mean > 1.5 * full.nees.mean
 
 
+def test_claims_make_up_for_noises_that_the_calibration_run_shows_to_be_too_small(record, white):
+    """Noises said to have a ninth of their variance: predicted is a third, the claim what it was but for who was gated."""
+    full = white[1]
+
+    def ninth(channel):
+        parts = {name: getattr(channel, name)._replace(variance=getattr(channel, name).variance / 9)
+                 for name in ("common", "subject")}  # fmt: skip
+        return channel._replace(doubt=channel.doubt / 9, white=channel.white / 9, **parts)
+
+    n = full.noises
+    small = n._replace(**{name: ninth(getattr(n, name)) for name in ("speed", "turn", "range", "bearing")})
+    found = sf.run_robots(record, [0], ["stand-alone"], until=30.0, noises=small).row("stand-alone", 0)
+    known = full.row("stand-alone", 0)
+    assert found.predicted == pytest.approx(known.predicted / 3, rel=0.05)
+    assert known.claimed * 0.8 < found.claimed
+    assert found.nees.mean < 1.5 * max(known.nees.mean, 3.0)
+
+
 def test_json_and_table(folder):
     words = ["run", "utias", "--data", folder, "--until", 30]
     done = command(*words, "--link", "0,1", "--estimator", "lwin", "--format", "json")
@@ -253,9 +271,11 @@ def test_the_table_and_the_figure(white):
     text = run._repr_html_()
     assert re.search(r"stand-alone</td><td[^>]*>0</td><td[^>]*>0\.\d", text)
     assert re.search(r"0\.0\d+ of range", text)
-    left, right = run.plot().axes
+    left, *robots = run.plot().axes
     assert left.get_xlabel() == "link probability µ"
-    assert len(right.lines) == 2 * 3
+    assert [axes.get_ylabel() for axes in robots] == [f"robot {i} [m]" for i in (1, 2, 3)]
+    alone = np.hypot(*run.alone[:, 1, :2].T)
+    np.testing.assert_allclose(robots[1].lines[0].get_ydata()[-1], alone[-1])
 
 
 def edit(name, change):
@@ -376,7 +396,10 @@ def test_robots_of_the_record(landmarks):
             assert (row.predicted / first.predicted) / (row.realised / first.realised) == pytest.approx(1.0, abs=0.2)
     if landmarks:
         assert run.row("itns", 1).realised < 0.7 * run.row("stand-alone", 1).realised
-        assert run.row("split-ci", 1).verdict == "consistent"
+        assert [run.row(name, 1).verdict for name in ("stand-alone", "itns")] == ["consistent"] * 2
+        assert run.row("split-ci", 1).verdict == "cautious"  # it allows for correlations that are not there
+    else:
+        assert [run.row(name, 1).verdict for name in CONSISTENT[1:]] == ["consistent"] * 3
 
 
 @there

@@ -217,6 +217,68 @@ def test_diffusion_follows_the_network_covariance_of_the_paper():
         assert found.values("trace", agent=agent + 1)[0, -1] == pytest.approx(np.trace(joint[at, at]), rel=1e-9)
 
 
+# R. Forsling, "Track fusion design in decentralized target tracking", poster, Linköping University, November 2023:
+# root of the trace of the claim of the third agent at k = 2, 5, 8, 11, from github.com/robinforsling/dtt (commit f0f5660),
+# poster/matlab/data/data__design_evaluation_results_rmt.tex; scenario and fusion rules: poster/matlab/track_fusion_design.m
+FORSLING = {
+    "naive": (8.129, 5.165, 4.832, 4.820),
+    "covariance-intersection": (12.713, 8.395, 7.912, 7.893),
+    "inverse covariance intersection": (11.812, 7.640, 7.359, 7.356),
+}
+
+
+@pytest.mark.parametrize("rule", FORSLING)
+def test_claims_of_three_trackers_in_a_ring_are_the_published_numbers(rule):
+    wide, turn = np.diag([100.0, 25.0]), np.array([[0.5, -np.sqrt(0.75)], [np.sqrt(0.75), 0.5]])
+    still, moves = np.eye(4), np.kron([[1, 1], [0, 1]], np.eye(2))
+    Q = 4 * np.kron([[1 / 3, 1 / 2], [1 / 2, 1]], np.eye(2))
+    talks = [np.zeros((3, 3)), *(np.eye(3)[:, [(k + 1) % 3]] @ np.eye(3)[[k % 3]] for k in range(12))]
+    scenario = {
+        "schema": "stochfuse.scenario/1",
+        # the poster starts every agent from its own first measurement: one step more, from next to no knowledge
+        "model": {
+            "F": np.stack([still, still, *[moves] * 11]).tolist(),
+            "Q": np.stack([0 * still, 0 * still, *[Q] * 11]).tolist(),
+            "H": np.eye(2, 4).tolist(),
+            "R": 1,
+        },
+        "initial": {"P": np.diag([1e9, 1e9, 100, 100]).tolist()},
+        "network": {"agents": 3, "steps": 13, "link": np.stack(talks).tolist()},
+        "agent": [{"R": R.tolist()} for R in (wide, turn @ wide @ turn.T, turn.T @ wide @ turn)],
+    }
+    how = {"estimator": rule, "criterion": "trace"} if rule == "covariance-intersection" else {"estimator": rule}
+    if rule.startswith("inverse"):
+        how["estimator"] = literature().InverseCovarianceIntersection
+    found = sf.predict(scenario, None, "general", "claimed", **how)
+    claims = np.sqrt(found.values("trace", agent=3)[0, [2, 5, 8, 11]])
+    assert claims == pytest.approx(FORSLING[rule], abs=6e-4)  # three decimals are printed
+
+
+def test_diffusion_settles_where_the_paper_says():
+    """Cattivelli and Sayed 2010, steady state: P = 𝓕 P 𝓕ᵀ + 𝓖, solved, of filters that have settled (Riccati)."""
+    from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
+
+    F, H, Q = (np.array(SMALL["model"][name], float) for name in "FHQ")
+    mixes, every = np.array([[1, 1, 0], [1, 1, 1], [0, 1, 1]]) / [[2], [3], [2]], (2.0, 5.0, 0.5)
+    priors = [solve_discrete_are(F.T, H.T, Q, np.array([[R]])) for R in every]
+    K = [prior @ H.T / (H @ prior @ H.T + R) for prior, R in zip(priors, every, strict=True)]
+    keeps = np.stack([np.eye(2) - gain @ H for gain in K])
+    moves = np.block([[c * A @ F for c, A in zip(row, keeps, strict=True)] for row in mixes])
+    shared = np.concatenate([np.tensordot(row, keeps, 1) for row in mixes])
+    noise = sum(
+        R * np.kron(np.outer(mixes[:, i], mixes[:, i]), K[i] @ K[i].T) for i, R in enumerate(every)
+    )  # fmt: skip
+    settled = solve_discrete_lyapunov(moves, shared @ Q @ shared.T + noise)
+
+    scenario = {**SMALL, "network": {"agents": 3, "steps": 60, "link": [[0, 1, 0], [1, 0, 1], [0, 1, 0]]}}
+    scenario["initial"], scenario["agent"] = {"P": SMALL["initial"]["P"]}, [{"R": R} for R in every]
+    found = sf.predict(scenario, None, "general", "actual", estimator=literature().DiffusionKalman)
+    traces = [found.values("trace", agent=i + 1)[0, -1] for i in range(3)]
+    assert traces == pytest.approx(np.diag(settled).reshape(3, 2).sum(axis=1), rel=1e-9)
+    mean = np.mean(traces)  # the paper's network mean square deviation
+    assert mean == pytest.approx(np.trace(settled) / 3, rel=1e-9)
+
+
 def rule_of(fuse, **says):
     return SimpleNamespace(fuse=fuse, name="mine", **says)
 
@@ -310,6 +372,13 @@ def test_names_travel_and_are_equal_only_with_one_rule():
         ("nowhere.at_all:Mine", r"got 'nowhere.at_all:Mine' \(ModuleNotFoundError"),
         ("math:Mine", r"got 'math:Mine' \(AttributeError"),
         ("naiv", r"expected one of .*, or package.module:Class, got 'naiv' \(did you mean 'naive'\?\)"),
+        ("mine.Mine", r"or package.module:Class, got 'mine.Mine' \(did you mean 'mine:Mine'\?\)"),
+        ("./mine.py:Mine", r"names and no path of a file, got './mine.py:Mine' \(did you mean 'mine:Mine'\?\)"),
+        ("mine:", r"names and no path of a file, got 'mine:'$"),
+        (
+            rule_of(lambda x: (x[0], 1)),
+            r"estimator mine: expected a method fuse\(self, x, P\), got one called by fuse\(x\)",
+        ),
         (3, r"with a method fuse\(x, P\), got builtins:int, which has none"),
         (type("Needs", (Adds,), {"__init__": lambda self, weight: None}), "made without arguments, or an object of it"),
     ],

@@ -496,6 +496,13 @@ def test_exactly_singular_pairs():
     assert pair_weights(*crossed, "trace") == pytest.approx([0.5])
 
 
+@pytest.mark.parametrize("name", ["det", "trace"])
+def test_a_direction_that_two_know_alike_does_not_move_the_weight(name):
+    """Also one that is exactly alike, as of agents that start with one speed: δ = 0."""
+    P, Q = np.diag([4.0, 1.0, 9.0]), np.diag([1.0, 1.0, 16.0])
+    assert pair_weights(P[None], Q[None], name)[0] == pytest.approx(exact_weight(P, Q, name), abs=1e-9)
+
+
 def test_empty_stacks():
     none = np.zeros((0, 3, 3))
     assert pair_weights(none, none).shape == (0,)
