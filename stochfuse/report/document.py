@@ -76,11 +76,13 @@ class Told(NamedTuple):
     words : of the command line that repeats it, without the program's name.
     scenario : with a scenario file's keys, and with what options changed in it.
     said : notes and warnings.
+    lines : several commands that repeat it, in the place of `words`.
     """
 
     words: Sequence[str]
     scenario: Mapping[str, Any]
     said: Sequence[str] = ()
+    lines: Sequence[str] = ()
 
 
 def document(report: Report, told: Told) -> str:
@@ -162,7 +164,8 @@ def _words(tables: Sequence[Table], asked: Sequence[str]) -> str:
 
 def _again(told: Told) -> str:
     """The command that does it again."""
-    text = f"<pre>{escape(shlex.join(('stochfuse', *told.words)))}</pre>"
+    lines = told.lines or [shlex.join(("stochfuse", *told.words))]
+    text = f"<pre>{escape(chr(10).join(lines))}</pre>"
     if "-" in told.words:
         text += "<p>“-” is standard input.</p>"
     return text

@@ -12,9 +12,10 @@ import pytest
 
 import stochfuse as sf
 from stochfuse.errors import ScenarioError, StochfuseError, UsageError
-from stochfuse.explore import answers
+from stochfuse.explore import answers, saved
 from stochfuse.explore.answers import Work
 from stochfuse.explore.network import picture
+from stochfuse.explore.saved import Shown
 from stochfuse.explore.state import Asked, begun, field_of, opened, preset, with_log
 from stochfuse.scenario.as_toml import to_toml
 from tests.cli.command import run, strict_json
@@ -104,14 +105,14 @@ def test_python_runs_and_prints_the_same(capsys):
 def test_csv_has_every_number():
     question = asked(steps=2, link=0.4)
     curves = [*answer(question, "simplified"), *answer(question, "estimator local-fusion-graph")]
-    lines = answers.records(curves).splitlines()
+    lines = saved.records(curves).splitlines()
     assert lines[0].startswith("series,method,quantity")
     assert len(lines) == 1 + 22 * 2 + 2 * 12 * 2
 
 
 def test_a_page_to_be_sent_repeats_the_command():
     question = asked(steps=2, link=0.4)
-    page = answers.page_of(question, answer(question, "estimator local-fusion-graph"))
+    page = saved.page_of(question, Shown(answer(question, "estimator local-fusion-graph")))
     assert "stochfuse compare thesis-transient --steps 2 --link 0:1:0.1,0.4" in page
 
 
