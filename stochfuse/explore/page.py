@@ -412,6 +412,8 @@ class Page:
         if isinstance(found, Exception):
             self._refused[name] = str(found) or type(found).__name__
             self._show_about()
+        if name == "progress" and work is self._work_least:
+            return  # it has no end that would be told
         if name == "progress":
             self._status.text = f"quick answers are here; exact ones are coming: {escape(str(found))}"
         elif name == "done":
@@ -504,12 +506,11 @@ class Page:
 
     def _show_about(self) -> None:
         """Explain the link or the agent that was pointed at."""
-        picture, text, link = (
-            self._picture,
-            "Click on a link or an agent, or choose one. Wider links are worth more.",
-            None,
-        )
+        picture, text = self._picture, "Click on a link or an agent, or choose one. Wider links are worth more."
+        link: float | None = None
         agent: int | None = None
+        if picture is not None and picture.first:
+            text += f" To improve first: {', '.join(map(picture.name, sorted(picture.first)))}."
         if picture is not None and self._pointed is not None:
             kind, place = self._pointed
             if kind == "agent" and place[0] < len(picture.names):

@@ -127,7 +127,8 @@ def opened(name: str, content: bytes, logs: Mapping[str, bytes]) -> Mapping[str,
 
 
 def _renamed(mapping: Mapping[str, Any], file: str) -> dict[str, Any]:
-    return {**mapping, "network": {**mapping["network"], "link": {"file": file}}}
+    network = mapping["network"]
+    return {**mapping, "network": {**network, "link": {**network.get("link", {}), "file": file}}}
 
 
 def _in_folder(name: str, content: bytes, use: Any) -> Any:
