@@ -74,6 +74,15 @@ class Picture:
         """A link in words."""
         return f"{self.names[pair[1]]} → {self.names[pair[0]]}"
 
+    def mended(self) -> str:
+        """Say which link has most to gain: the slope times what its µ lacks of 1; empty where none differs."""
+        gains = {pair: -slope * (1.0 - float(self.link[pair])) for pair, slope in self.worth.items()}
+        most = max(gains.values(), default=0.0)
+        best = [self.name(pair) for pair, gain in gains.items() if gain >= most * (1 - 1e-6)]
+        if most <= 0 or len(best) == len(gains):
+            return ""
+        return f" To mend first: {', '.join(best)}; perfect, it would take about {most:.3g} off (to first order)."
+
     def about_link(self, pair: tuple[int, int], asked: Asked) -> str:
         """Say what a link is and what it is worth."""
         at = f" in step {self.step}" if self.step else ""

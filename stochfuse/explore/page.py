@@ -509,8 +509,7 @@ class Page:
         picture, text = self._picture, "Click on a link or an agent, or choose one. Wider links are worth more."
         link: float | None = None
         agent: int | None = None
-        if picture is not None and picture.first:
-            text += f" To improve first: {', '.join(map(picture.name, sorted(picture.first)))}."
+        text += picture.mended() if picture is not None else ""
         if picture is not None and self._pointed is not None:
             kind, place = self._pointed
             if kind == "agent" and place[0] < len(picture.names):

@@ -233,7 +233,7 @@ class LinkFile(StrictTable):
     file: str = Field(description="its path, relative to the scenario file; see `stochfuse links`")
     columns: dict[str, str] | None = Field(
         None,
-        description="the file's names of columns, by ours: { sender = 'src', receiver = 'dst' }; of seq, received, …",
+        description="its names of columns, by ours: { sender = 'src', receiver = 'dst' }; of seq, received, …",
     )
 
 

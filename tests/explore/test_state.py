@@ -84,6 +84,10 @@ def test_the_rest_is_what_the_commands_print():
     ]
     assert load.value.mean(axis=1) == pytest.approx(means)
     assert "rank 1 of 6" in drawn.about_link((0, 1), question)
+    assert drawn.mended() == ""  # all are alike
+    one = answer(asked(steps=2, link=0.4, changed=(((0, 1), 0.9), ((1, 0), 0.1))), "sensitivity")
+    most = max(one.worth, key=lambda pair: -one.worth[pair] * (1 - one.link[pair]))
+    assert f"To mend first: {one.name(most)}; perfect" in one.mended()
     assert "hears 2 other(s), with µ = 0.4" in drawn.about_agent(0, question)
 
 
