@@ -79,7 +79,7 @@ def numbers(asked: Asked, curves: Sequence[Curve]) -> Table:
     what = "" if view is None else f"{view.what.partition(': ')[2]}; {view.whom}"
     rows = tuple((c.name, c.quantity, _value(c.steps), c.how.replace("; ± one standard error", "")) for c in curves)
     title = f"{what}, step {asked.scenario.network.steps}{at}"
-    return Table((title,), ("by", "quantity"), ("value [95 %]", "how exact"), rows)
+    return Table((title,), ("by", "quantity", "value [95 %]", "how exact"), (), rows)
 
 
 def _value(line: Line) -> str:
@@ -117,7 +117,7 @@ def _tables(asked: Asked, shown: Shown) -> list[Table]:
             found.append(estimator_table(view))
     if shown.picture is not None and shown.picture.worth:
         title = ("What links are worth: the slope of the value in the probability of one link (simplified)",)
-        found.append(Table(title, ("link",), ("µ", "dE/dµ"), tuple(_worth(shown.picture))))
+        found.append(Table(title, ("link",), ("µ", "dE/dµ", "perfect, to first order"), tuple(_worth(shown.picture))))
     if shown.load is not None:
         rows = zip(("local-fusion-graph", "naive"), shown.load.value, strict=True)
         cells = tuple((rule, *(number(value) for value in values)) for rule, values in rows)
@@ -126,10 +126,13 @@ def _tables(asked: Asked, shown: Shown) -> list[Table]:
     return found
 
 
-def _worth(picture: Picture) -> list[tuple[str, str, str]]:
-    """Links with their slopes, those first that lower the value most."""
-    ranked = sorted(picture.worth.items(), key=lambda one: one[1])
-    return [(picture.name(pair), f"{picture.link[pair]:.4g}", number(slope)) for pair, slope in ranked]
+def _worth(picture: Picture) -> list[tuple[str, ...]]:
+    """Links with their slopes, those first that would lower the value most if they were perfect."""
+    found = [(pair, float(picture.link[pair]), slope) for pair, slope in picture.worth.items()]
+    return [
+        (picture.name(pair), f"{µ:.4g}", number(slope), f"{slope * (1 - µ):+.3g}")
+        for pair, µ, slope in sorted(found, key=lambda one: one[2] * (1 - one[1]))
+    ]
 
 
 def page_of(asked: Asked, shown: Shown) -> str:

@@ -60,7 +60,8 @@ footer { margin-top: 2rem; color: #555; font-size: .85rem; }
 @page { size: A4; margin: 16mm 14mm; }
 @media print {
   body { font-size: 10pt; margin: 0; max-width: none; padding: 0; }
-  h2, dt { break-after: avoid; } figure, tr, dt { break-inside: avoid; } thead { display: table-header-group; }
+  h2, dt, .scroll div > div { break-after: avoid; }
+  figure, tr, dt { break-inside: avoid; } thead { display: table-header-group; }
   th, td { padding: .1rem .5rem; } .scroll { overflow: visible; } .screen { display: none; }
   figure svg, figure img { width: 100% !important; max-width: none !important; max-height: 120mm; }
 }
@@ -97,7 +98,7 @@ def document(report: Report, told: Told) -> str:
     tables = [tables] if isinstance(tables, Table) else list(tables)
     title = next((line for table in tables for line in table.title), "stochfuse")
     figure, why = _figure(report, title)
-    notes = [*told.said, *([why] if why else [])]
+    notes = [*(note.removeprefix("note: ") for note in told.said), *([why] if why else [])]
     parts = {
         "Result": f'<div class="scroll">{to_html(tables)}</div>',
         "Figure": figure,
