@@ -26,11 +26,11 @@ from bokeh.plotting import figure
 
 from stochfuse.explore.answers import Line
 from stochfuse.explore.network import Picture
-from stochfuse.explore.state import Asked
+from stochfuse.explore.state import PageInput
 from stochfuse.report.plot import COLORS
 
 
-class Look(NamedTuple):
+class ThemeColours(NamedTuple):
     """Colours of a theme."""
 
     back: str
@@ -41,8 +41,8 @@ class Look(NamedTuple):
 
 
 SHADES = cividis(256)
-LIGHT = Look("#ffffff", "#1b1b1b", "#dcdcdc", COLORS, tuple(reversed(SHADES[:215])))
-DARK = Look(
+LIGHT = ThemeColours("#ffffff", "#1b1b1b", "#dcdcdc", COLORS, tuple(reversed(SHADES[:215])))
+DARK = ThemeColours(
     "#16181b", "#ececec", "#3a3e43",
     ("#56B4E9", "#E69F00", "#2FC79A", "#E59BC5", "#F0E442", "#FF8A50", "#FFFFFF", "#C9B27A"), SHADES[60:],
 )  # fmt: skip
@@ -107,14 +107,14 @@ class Chart:
         self.figure.add_layout(line)
         return line
 
-    def dress(self, look: Look) -> None:
+    def dress(self, look: ThemeColours) -> None:
         """Put on the colours of a theme."""
         dress(self.figure, look)
         for line in self.figure.select({"type": Span}):
             line.line_color = line.hover_line_color = look.ink
 
 
-def dress(plot: Any, look: Look) -> None:
+def dress(plot: Any, look: ThemeColours) -> None:
     """Put the colours of a theme on a figure."""
     plot.background_fill_color = plot.border_fill_color = look.back
     plot.outline_line_color = look.grid
@@ -182,7 +182,7 @@ class NetworkChart:
         )
         self.figure.add_layout(self._bar, "right")
 
-    def show(self, picture: Picture, asked: Asked) -> None:
+    def show(self, picture: Picture, asked: PageInput) -> None:
         """Draw a network."""
         pairs = picture.pairs
         arcs = [picture.arc(*pair) for pair in pairs]
@@ -219,7 +219,7 @@ class NetworkChart:
         label = f"Network of {len(picture.names)} agents, {len(pairs)} links. {text}"
         self.figure.html_attributes = {"role": "img", "aria-label": label}
 
-    def dress(self, look: Look) -> None:
+    def dress(self, look: ThemeColours) -> None:
         """Put on the colours of a theme."""
         dress(self.figure, look)
         self._mu.palette, self._error.palette = list(look.links), list(look.links)

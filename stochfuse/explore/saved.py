@@ -12,9 +12,9 @@ import shlex
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from stochfuse.explore.answers import Curve, Line, Told
+from stochfuse.explore.answers import Curve, Line, PageAnswer
 from stochfuse.explore.network import Picture
-from stochfuse.explore.state import FILE, Asked
+from stochfuse.explore.state import FILE, PageInput
 from stochfuse.prediction.compare import EstimatorComparison
 from stochfuse.report import document
 from stochfuse.report.comparisons import EstimatorView, estimator_table
@@ -40,8 +40,8 @@ class Shown(NamedTuple):
 
     curves: Sequence[Curve]
     picture: Picture | None = None
-    load: Told | None = None
-    least: Told | None = None
+    load: PageAnswer | None = None
+    least: PageAnswer | None = None
 
 
 def colour(name: str, colors: Sequence[str]) -> str:
@@ -65,14 +65,14 @@ def lines_of(curves: Sequence[Curve], colors: Sequence[str], along: str) -> list
     ]
 
 
-def axes_of(asked: Asked, curves: Sequence[Curve]) -> tuple[str, str]:
+def axes_of(asked: PageInput, curves: Sequence[Curve]) -> tuple[str, str]:
     """What stands along the axis of links, and up the axis of values."""
     y = curves[0].views[0].axis if curves and len(asked.quantities) == 1 else asked.measure.label
     unit = f" [{asked.measure.unit}]" if asked.measure.unit and "[" not in y else ""
     return KINDS[asked.kind], y + unit
 
 
-def numbers(asked: Asked, curves: Sequence[Curve]) -> Table:
+def numbers(asked: PageInput, curves: Sequence[Curve]) -> Table:
     """The present numbers, at the last step."""
     at = {"link": f" at µ = {asked.link:g}" if asked.link is not None else ""}.get(asked.kind, " at its own links")
     view = curves[0].views[-1] if curves else None
@@ -105,7 +105,7 @@ def records(curves: Sequence[Curve]) -> str:
     return to_csv(headings, [[row.get(key, "") for key in headings] for row in rows])
 
 
-def _tables(asked: Asked, shown: Shown) -> list[Table]:
+def _tables(asked: PageInput, shown: Shown) -> list[Table]:
     """The present numbers, the curves', what links are worth, and the messages."""
     views = {c.name: c.views for c in shown.curves}
     found = [numbers(asked, shown.curves)]
@@ -135,7 +135,7 @@ def _worth(picture: Picture) -> list[tuple[str, ...]]:
     ]
 
 
-def page_of(asked: Asked, shown: Shown) -> str:
+def page_of(asked: PageInput, shown: Shown) -> str:
     """Return a page to be sent, of all that is shown."""
     lines = asked.commands([c.name for c in shown.curves if c.sampled])
     if any(FILE in line for line in lines):
@@ -144,10 +144,10 @@ def page_of(asked: Asked, shown: Shown) -> str:
     said = [*([shown.least.text] if shown.least is not None else []), *notes(shown.curves)]
     tables = _tables(asked, shown)
     report = Report(lambda: tables, lambda: records(shown.curves), lambda: None, lambda: _figure(asked, shown.curves))
-    return document.document(report, document.Told(words, asked.scenario.to_mapping(), said, lines))
+    return document.document(report, document.DocumentNote(words, asked.scenario.to_mapping(), said, lines))
 
 
-def figure_of(asked: Asked, curves: Sequence[Curve]) -> str:
+def figure_of(asked: PageInput, curves: Sequence[Curve]) -> str:
     """Return the curves as a figure, SVG.
 
     Raises
@@ -158,7 +158,7 @@ def figure_of(asked: Asked, curves: Sequence[Curve]) -> str:
     return document.vectors(_figure(asked, curves))
 
 
-def _figure(asked: Asked, curves: Sequence[Curve]) -> Any:
+def _figure(asked: PageInput, curves: Sequence[Curve]) -> Any:
     figure = figure_class()(figsize=(10.0, 4.6), layout="constrained")
     x, y = axes_of(asked, curves)
     for axes, along, label in zip(figure.subplots(1, 2), ("over", "steps"), (x, "step k"), strict=True):
