@@ -73,6 +73,5 @@ def simulate(
     found = simulated(given, runs, metric=metric, folder=output, force=force, **way)
     show(found, format, plot, digits)
     if output is not None:
-        typer.echo(
-            f"note: written to {output}: run the same with --measurements {output / 'measurements.csv'}", err=True
-        )
+        files = " ".join(f"--{name} {output / f'{name}.csv'}" for name in ("measurements", "arrivals", "truth"))
+        typer.echo(f"note: written to {output}: run the same with {files}", err=True)

@@ -298,7 +298,7 @@ def _matched(
             left = [header[i] for i in range(len(header)) if i not in used]
             raise ColumnsError(
                 f"{table.name}: expected columns {_names(asked)}; column '{field.name}' is missing from "
-                f"{', '.join(header)}{nearest(field.name, left)}"
+                f"{', '.join(header)}{nearest(field.name, left)}; --columns OURS=THEIRS names others"
             )
     skipped = tuple(header[i] for i in range(len(header)) if i not in used)
     unknown = [name for i, name in enumerate(names) if i not in used and name is not None]

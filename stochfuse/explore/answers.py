@@ -7,9 +7,6 @@ the one before ends at its next sign of life (`stochfuse.engines.progress`), and
 
 from __future__ import annotations
 
-import csv
-import io
-import shlex
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from time import monotonic
@@ -18,20 +15,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.engines.progress import Progress, listening
-from stochfuse.errors import StochfuseError, TooManyError, UsageError
+from stochfuse.errors import StochfuseError, TooManyError
 from stochfuse.explore.network import Picture, picture
 from stochfuse.explore.state import COARSE, FINE, POWER, ROUGH, RUNS, PageInput, links_of
-from stochfuse.prediction.compare import EstimatorComparison, compare_estimators
+from stochfuse.prediction.compare import compare_estimators
 from stochfuse.prediction.predict import EASY, EASY_EXCHANGE, exchange_of, predict_several
 from stochfuse.questions.least_link import least_link
 from stochfuse.questions.messages import RULES, message_load
 from stochfuse.questions.sensitivity import sensitivity
-from stochfuse.report import document
-from stochfuse.report.comparisons import EstimatorView, estimator_report
-from stochfuse.report.plot import figure_class
-from stochfuse.report.predictions import WIDTH_95, PredictionView, predict_csv
-from stochfuse.report.predictions import report as predictions_report
-from stochfuse.report.table import Report, to_csv
+from stochfuse.report.predictions import WIDTH_95, PredictionView
 from stochfuse.scenario.registry import GENERAL, MONTE_CARLO, OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.scenario import Scenario
 
@@ -291,47 +283,3 @@ class _Listener(Progress):
             self._said = monotonic()
             share = f", {done:,} of {total:,}" if total else ""
             self._work.say(self._number, "progress", f"{self._name}: {what}{share}")
-
-
-def records(curves: Sequence[Curve]) -> str:
-    """Return all curves' numbers as the command line's CSV has them, the series' names before them."""
-    rows: list[dict[str, str]] = []
-    for curve in curves:
-        for view in curve.views:
-            rows += [{"series": curve.name, **row} for row in csv.DictReader(io.StringIO(predict_csv(view)))]
-    headings = list(dict.fromkeys(key for row in rows for key in row))
-    return to_csv(headings, [[row.get(key, "") for key in headings] for row in rows])
-
-
-def report(asked: PageInput, curves: Sequence[Curve]) -> Report:
-    """Return what the curves show as a report: the estimators side by side, or without any the first quick engine."""
-    views = {curve.name: curve.views[0] for curve in curves}
-    found = [views[name].prediction for name in asked.estimators if name in views]
-    if not found:
-        return predictions_report([curves[0].views[0]])
-    compared = EstimatorComparison(tuple(found))
-    return estimator_report(EstimatorView(compared, asked.measure, asked.agent, quantities=asked.quantities))
-
-
-def page_of(asked: PageInput, curves: Sequence[Curve]) -> str:
-    """Return a page to be sent, as --report writes it."""
-    words = asked.commands([c.name for c in curves if c.sampled])
-    chosen = next((line for line in words if " compare " in line), words[0])
-    said = dict.fromkeys(note for c in curves for view in c.views for note in view.prediction.notes)
-    told = document.DocumentNote(shlex.split(chosen)[1:], asked.scenario.to_mapping(), tuple(said))
-    return document.document(report(asked, curves), told)
-
-
-def figure_of(asked: PageInput, curves: Sequence[Curve]) -> str:
-    """Return the figure, as --plot draws it.
-
-    Raises
-    ------
-    StochfuseError
-        If matplotlib is not installed.
-    """
-    draw = report(asked, curves).draw
-    if draw is None:
-        raise UsageError("there is no figure of this")
-    figure_class()
-    return document.vectors(draw())

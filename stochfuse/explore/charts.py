@@ -24,11 +24,10 @@ from bokeh.models import (
 from bokeh.palettes import cividis
 from bokeh.plotting import figure
 
-from stochfuse.explore.answers import Curve, Line
+from stochfuse.explore.answers import Line
 from stochfuse.explore.network import Picture
 from stochfuse.explore.state import PageInput
 from stochfuse.report.plot import COLORS
-from stochfuse.scenario.registry import ESTIMATORS, OPTIMAL, SIMPLIFIED
 
 
 class ThemeColours(NamedTuple):
@@ -47,16 +46,6 @@ DARK = ThemeColours(
     "#16181b", "#ececec", "#3a3e43",
     ("#56B4E9", "#E69F00", "#2FC79A", "#E59BC5", "#F0E442", "#FF8A50", "#FFFFFF", "#C9B27A"), SHADES[60:],
 )  # fmt: skip
-DASH = {"claimed": "dashed", "actual": "solid", "consistency": "solid", "bias": "dotted", "rms": "dotdash"}
-
-
-def colour(name: str, look: ThemeColours) -> str:
-    """Colour of a series, the same whatever else is shown."""
-    place = {SIMPLIFIED: 0, OPTIMAL: 6}.get(name)
-    if place is None:
-        place = 1 + ESTIMATORS.index(name.removeprefix("estimator "))
-    return look.curves[place % len(look.curves)]
-
 
 NOTHING = {"xs": [[0, 1]], "ys": [[0, 1]], "name": [""], "color": ["transparent"], "dash": ["solid"]}
 """Axes need something to go by."""
@@ -150,19 +139,6 @@ def key_of(lines: Sequence[tuple[str, str, str, Line]]) -> str:
     )
 
 
-def lines_of(curves: Sequence[Curve], look: ThemeColours, along: str) -> list[tuple[str, str, str, Line]]:
-    """Curves as `Chart.show` takes them, along "over" or "steps"."""
-    return [
-        (
-            c.name if c.name in (SIMPLIFIED, OPTIMAL) and c.quantity == "claimed" else f"{c.name}, {c.quantity}",
-            colour(c.name, look),
-            "dotted" if c.name == OPTIMAL and c.quantity == "claimed" else DASH[c.quantity],
-            getattr(c, along),
-        )
-        for c in curves
-    ]
-
-
 class NetworkChart:
     """The network; what is pointed at is told through `links` and `agents`, by the indices selected in them."""
 
@@ -198,7 +174,11 @@ class NetworkChart:
         self.figure.add_tools(TapTool(renderers=[arcs, dots]))
         self.figure.add_tools(HoverTool(renderers=[arcs], tooltips=[("link", "@name"), ("µ", "@mu{0.000}")]))
         self._bar = ColorBar(
-            color_mapper=self._mu, ticker=BasicTicker(desired_num_ticks=5), width=8, title="µ", padding=4
+            color_mapper=self._mu,
+            ticker=BasicTicker(desired_num_ticks=5),
+            width=8,
+            padding=4,
+            major_label_overrides={1: "µ = 1"},
         )
         self.figure.add_layout(self._bar, "right")
 
@@ -246,4 +226,4 @@ class NetworkChart:
         self._dots.glyph.line_color = self._text.glyph.text_color = look.ink
         self._text.glyph.background_fill_color = self._heads.glyph.line_color = look.back
         self._bar.background_fill_color = look.back
-        self._bar.major_label_text_color = self._bar.title_text_color = look.ink
+        self._bar.major_label_text_color = look.ink

@@ -74,6 +74,15 @@ class Picture:
         """A link in words."""
         return f"{self.names[pair[1]]} → {self.names[pair[0]]}"
 
+    def mended(self) -> str:
+        """Say which link has most to gain: the slope times what its µ lacks of 1; empty where none differs."""
+        gains = {pair: -slope * (1.0 - float(self.link[pair])) for pair, slope in self.worth.items()}
+        most = max(gains.values(), default=0.0)
+        best = [self.name(pair) for pair, gain in gains.items() if gain >= most * (1 - 1e-6)]
+        if most <= 0 or len(best) == len(gains):
+            return ""
+        return f" To mend first: {', '.join(best)}; perfect, it would take about {most:.3g} off (to first order)."
+
     def about_link(self, pair: tuple[int, int], asked: PageInput) -> str:
         """Say what a link is and what it is worth."""
         at = f" in step {self.step}" if self.step else ""
@@ -88,19 +97,25 @@ class Picture:
             f"simplified); rank {rank} of {len(self.worth)}.{best}"
         )
 
+    def senses(self, i: int, asked: PageInput) -> bool:
+        """Whether an agent measures anything itself."""
+        return bool(np.any(asked.scenario.sensors[asked.scenario.sensor_of[i]].H))
+
     def about_agent(self, i: int, asked: PageInput) -> str:
         """Say what an agent has and gets."""
         scenario = asked.scenario
         sensor = scenario.sensors[scenario.sensor_of[i]]
         heard = [float(µ) for µ in self.link[i] if not np.isnan(µ) and µ > LEAST]
-        seen = (
-            "no sensor" if not sensor.H.size or not np.any(sensor.H) else f"a sensor of {sensor.H.shape[-2]} number(s)"
-        )
+        seen = "measures nothing itself"
+        if self.senses(i, asked):
+            R = sensor.R if sensor.R.ndim == 2 else sensor.R[-1]
+            deviations = ", ".join(f"{deviation:.4g}" for deviation in np.sqrt(np.diag(R)))
+            seen = f"measures with standard deviation {deviations}"
         error = (
             "" if np.isnan(self.errors[i]) else f" Its own {asked.measure.label}: {self.errors[i]:.5g} (simplified)."
         )
         mean = f", with µ = {np.mean(heard):.3g} on average" if heard else ""
-        return f"Agent {self.names[i]}: {seen}; hears {len(heard)} other(s){mean}.{error}"
+        return f"Agent {self.names[i]} {seen}; hears {len(heard)} other(s){mean}.{error}"
 
 
 def picture(asked: PageInput) -> Picture:

@@ -20,7 +20,6 @@ from bokeh.events import ConnectionLost, DocumentReady
 from bokeh.layouts import column, row
 from bokeh.models import (
     Button,
-    Checkbox,
     CheckboxGroup,
     CustomJS,
     Div,
@@ -34,10 +33,11 @@ from bokeh.models import (
 )
 
 from stochfuse.errors import StochfuseError, UsageError
-from stochfuse.explore import answers, state
+from stochfuse.explore import answers, saved, state
 from stochfuse.explore.answers import Curve, Line, PageAnswer, QuestionWorker
-from stochfuse.explore.charts import DARK, LIGHT, Chart, NetworkChart, key_of, lines_of
+from stochfuse.explore.charts import DARK, LIGHT, Chart, NetworkChart, key_of
 from stochfuse.explore.network import Picture
+from stochfuse.explore.saved import Shown, axes_of, lines_of
 from stochfuse.explore.state import OpenedScenario, PageInput, field_of
 from stochfuse.scenario.registry import ESTIMATORS, LFG, SIMPLIFIED
 from stochfuse.scenario.scenario import preset_names
@@ -50,7 +50,6 @@ WAIT = 30
 """Milliseconds that pass before a change is followed, in which others may come."""
 OWN, ALIKE = "the scenario's own", "all alike, µ below"
 QUANTITIES = ("claimed,actual", "claimed", "actual", "consistency", "bias", "rms")
-KINDS = {"link": "link probability µ of all links", "own": "µ of all links, if alike", "power": "radio power [dBm]"}
 HERE = Path(__file__).parent
 
 
@@ -73,8 +72,10 @@ class Page:
         self._refused: dict[str, str] = {}
         self._picture: Picture | None = None
         self._loads: PageAnswer | None = None
+        self._least_told: PageAnswer | None = None
         self._pointed: Any = None
         self._changed: dict[tuple[int, int], float] = {}
+        self._sensors: dict[int, float | None] = {}
         self._touched = False
         self._work = QuestionWorker(lambda *said: self._hand_on(self._work, *said))
         self._work_least = QuestionWorker(lambda *said: self._hand_on(self._work_least, *said), (answers.least,))
@@ -115,16 +116,16 @@ class Page:
             widget.stylesheets, widget.sizing_mode, widget.margin = [self._sheet], "stretch_width", (3, 0, 3, 0)
             self._errors[name] = self._div("", {"role": "alert"}, visible=False, margin=0)
             if name == "estimators":
-                children.append(self._div("Estimators"))
+                children.append(self._div("Estimators", margin=0))
                 widget.html_attributes = {"role": "group", "aria-label": "Estimators"}
             children += [widget, self._errors[name]]
             attribute = "active" if name == "estimators" else "value"
             follow = {"file": self._soon, "scenario": self._pick, "target": self._retarget}.get(name, self._change)
             self._on(widget, attribute, lambda _new, follow=follow: follow())
         self._status = self._div("", {"role": "status", "aria-live": "polite"}, name="status")
-        self._dark = Checkbox(label="dark", active=False, name="dark", stylesheets=[self._sheet])
+        self._dark = CheckboxGroup(labels=["dark"], active=[], name="dark", stylesheets=[self._sheet])
         self._on(self._dark, "active", lambda _: self._dress())
-        self._dark.js_on_change("active", CustomJS(code="stochfuse.theme(cb_obj.active);"))
+        self._dark.js_on_change("active", CustomJS(code="stochfuse.theme(cb_obj.active.length > 0);"))
         self._numbers = self._div(
             "", {"role": "region", "aria-label": "Numbers", "aria-live": "polite"}, name="numbers"
         )
@@ -169,13 +170,25 @@ class Page:
             title="µ of this link", low=0, high=1, step=0.05, stylesheets=[self._sheet], width=120, visible=False
         )
         self._on(self._one, "value", self._change_link)
+        self._senses = CheckboxGroup(
+            labels=["measures"], active=[0], stylesheets=[self._sheet], visible=False, align="end"
+        )
+        self._times = Spinner(
+            title="its noise R, times", low=0.01, step=0.5, stylesheets=[self._sheet], width=120, visible=False
+        )
+        self._on(self._senses, "active", lambda on: self._change_agent((self._times.value or 1.0) if on else None))
+        self._on(self._times, "value", self._change_agent)
+        self._undo = Button(label="Undo changes", stylesheets=[self._sheet], visible=False, align="end")
+        self._undo.on_click(lambda _: self._undone())
+        self._fields["times"], self._errors["times"] = self._times, self._div("", {"role": "alert"}, visible=False)
         for source, many in ((self._network.links, "link"), (self._network.agents, "agent")):
             self._on(source.selected, "indices", lambda new, many=many: self._clicked(many, new))
         wide: Any = {"sizing_mode": "stretch_width"}
+        told = row(self._which, self._one, self._senses, self._times, self._undo, styles={"flex-wrap": "wrap"}, **wide)
         self._figure_roots = [
             column(self._over.figure, self._keys[0], self._said_least, name="over", **wide),
             column(self._steps.figure, self._keys[1], name="steps", **wide),
-            column(self._network.figure, row(self._which, self._one, **wide), self._about, name="network", **wide),
+            column(self._network.figure, told, self._errors["times"], self._about, name="network", **wide),
             column(self._load.figure, self._keys[2], self._said_load, name="load", **wide),
         ]
 
@@ -206,7 +219,7 @@ class Page:
         scenario = PageInput(given).scenario
         network, f = scenario.network, self._fields
         own = network.link is not None or bool(network.cases)
-        self._given, self._changed, self._pointed, self._touched = given, {}, None, False
+        self._given, self._changed, self._sensors, self._pointed, self._touched = given, {}, {}, None, False
         self._quiet = True
         f["scenario"].options = [*dict.fromkeys([given.name, *f["scenario"].options])]
         f["scenario"].value, f["agents"].value, f["steps"].value = given.name, network.agents, network.steps
@@ -245,6 +258,7 @@ class Page:
             link=round(f["link"].value, 6) if alike else None,
             power=_number("power", f["power"].value) if f["power"].visible and not alike else None,
             changed=tuple(sorted(self._changed.items())),
+            sensors=tuple(sorted(self._sensors.items())),
             estimators=tuple(ESTIMATORS[i] for i in sorted(f["estimators"].active)),
             quantities=tuple(f["quantities"].value.split(",")),
             metric=f["metric"].value.strip() or None,
@@ -321,7 +335,7 @@ class Page:
     def _stale(self) -> None:
         self._work.stop()
         self._work_least.stop()
-        self._curves, self._refused, self._picture, self._loads = {}, {}, None, None
+        self._curves, self._refused, self._picture, self._loads, self._least_told = {}, {}, None, None, None
         self._numbers.text = self._said_least.text = self._said_load.text = self._this.text = ""
         self._least.visible = False
         self._status.text = "working …"
@@ -368,7 +382,7 @@ class Page:
             self._wrong({field_of(error): str(error)})
             return
         self._wrong({})
-        self._said_least.text, self._least.visible = "", False
+        self._said_least.text, self._least.visible, self._least_told = "", False, None
         self.asked = replace(self.asked, target=target)
         self._ask_least()
         self._show_this()
@@ -398,6 +412,8 @@ class Page:
         if isinstance(found, Exception):
             self._refused[name] = str(found) or type(found).__name__
             self._show_about()
+        if name == "progress" and work is self._work_least:
+            return  # it has no end that would be told
         if name == "progress":
             self._status.text = f"quick answers are here; exact ones are coming: {escape(str(found))}"
         elif name == "done":
@@ -432,11 +448,10 @@ class Page:
 
     def _show_curves(self) -> None:
         curves, look, asked = self._shown(), self._look, self.asked
-        y = curves[0].views[0].axis if curves and len(asked.quantities) == 1 else asked.measure.label
-        unit = f" [{asked.measure.unit}]" if asked.measure.unit and "[" not in y else ""
-        self._over.show(lines_of(curves, look, "over"), KINDS[asked.kind], y + unit)
-        self._steps.show(lines_of(curves, look, "steps"), "step k", y + unit)
-        self._keys[0].text = self._keys[1].text = key_of(lines_of(curves, look, "over"))
+        (x, y), colors = axes_of(asked, curves), look.curves
+        self._over.show(lines_of(curves, colors, "over"), x, y)
+        self._steps.show(lines_of(curves, colors, "steps"), "step k", y)
+        self._keys[0].text = self._keys[1].text = key_of(lines_of(curves, colors, "over"))
         at = {"link": asked.link, "power": asked.transmit_power}.get(asked.kind)
         self._at.location, self._at.visible = at, at is not None
         for chart in (self._over, self._steps):
@@ -456,6 +471,7 @@ class Page:
         self._said_load.text = escape(found.text)
 
     def _show_least(self, found: Any) -> None:
+        self._least_told = found if isinstance(found, PageAnswer) else None
         if isinstance(found, PageAnswer):
             self._least.location, self._least.visible = found.value, found.value is not None
             self._said_least.text = escape(found.text) + ". Drag the line, or type a target."
@@ -490,15 +506,14 @@ class Page:
 
     def _show_about(self) -> None:
         """Explain the link or the agent that was pointed at."""
-        picture, text, link = (
-            self._picture,
-            "Click on a link or an agent, or choose one. Wider links are worth more.",
-            None,
-        )
+        picture, text = self._picture, "Click on a link or an agent, or choose one. Wider links are worth more."
+        link: float | None = None
+        agent: int | None = None
+        text += picture.mended() if picture is not None else ""
         if picture is not None and self._pointed is not None:
             kind, place = self._pointed
             if kind == "agent" and place[0] < len(picture.names):
-                text = picture.about_agent(place[0], self.asked)
+                text, agent = picture.about_agent(place[0], self.asked), place[0]
             elif kind == "link" and place in picture.pairs:
                 text, link = picture.about_link(place, self.asked), float(picture.link[place])
         if "sensitivity" in self._refused:
@@ -507,6 +522,14 @@ class Page:
         self._quiet = True
         self._one.visible = link is not None and picture is not None and picture.step is None
         self._one.value = link
+        self._senses.visible = agent is not None
+        if agent is not None and picture is not None:
+            senses = picture.senses(agent, self.asked)
+            self._senses.active, self._times.visible = [0] if senses else [], senses
+            self._times.value = self._sensors.get(agent) or 1.0
+        else:
+            self._times.visible = False
+        self._undo.visible = bool(self._changed or self._sensors)
         self._which.value = (
             "" if self._pointed is None else f"{self._pointed[0]} {','.join(map(str, self._pointed[1]))}"
         )
@@ -518,30 +541,38 @@ class Page:
         self._changed[self._pointed[1]] = round(float(µ), 6)
         self._change()
 
+    def _change_agent(self, times: float | None) -> None:
+        """Let the agent that is pointed at measure with so many times its noise, or nothing."""
+        if self._pointed is None or self._pointed[0] != "agent":
+            return
+        self._sensors[self._pointed[1][0]] = times
+        self._change()
+
+    def _undone(self) -> None:
+        """Forget what was changed of single links and agents."""
+        self._changed, self._sensors = {}, {}
+        self._change()
+
     def _show_numbers(self) -> None:
         """The present numbers in a table, and what was refused."""
         asked, curves = self.asked, self._shown()
         if not curves and not self._refused:
             return
-        at = {"link": f" at µ = {asked.link:g}" if asked.link is not None else ""}.get(asked.kind, " at its own links")
-        last, view = asked.scenario.network.steps, curves[0].views[-1] if curves else None
+        table = saved.numbers(asked, curves)
         rows = "".join(
-            f"<tr><td>{escape(c.name)}</td><td>{escape(c.quantity)}</td><td class='n'>{_value(c.steps)}</td>"
-            f"<td class='soft'>{escape(c.how.replace('; ± one standard error', ''))}</td></tr>"
-            for c in curves
+            f"<tr><td>{escape(name)}</td><td>{escape(quantity)}</td><td class='n'>{value}</td>"
+            f"<td class='soft'>{escape(how)}</td></tr>"
+            for name, quantity, value, how in table.rows
         )
-        what = "" if view is None else f"{view.what.partition(': ')[2]}; {view.whom}"
-        notes = dict.fromkeys(note for c in curves for v in c.views for note in v.prediction.notes)
         refused = [
             f"{name.removeprefix('estimator ')}: {why}"
             for name, why in self._refused.items()
             if name not in ("least", "sensitivity")
         ]
-        listed = "".join(f"<li>{_lines(text)}</li>" for text in (*refused, *notes))
-        self._numbers.text = (
-            f"<div><b>{escape(what)}</b>, step {last}{at}</div><table><tr><th>by</th><th>quantity</th>"
-            f"<th>value [95 %]</th><th>how exact</th></tr>{rows}</table>"
-            + (f"<ul class='soft'>{listed}</ul>" if listed else "")
+        listed = "".join(f"<li>{_lines(text)}</li>" for text in (*refused, *saved.notes(curves)))
+        heads = "".join(f"<th>{heading}</th>" for heading in table.headings)
+        self._numbers.text = f"<div><b>{escape(table.title[0])}</b></div><table><tr>{heads}</tr>{rows}</table>" + (
+            f"<ul class='soft'>{listed}</ul>" if listed else ""
         )
 
     def _show_this(self) -> None:
@@ -566,13 +597,14 @@ class Page:
         if kind == "Scenario":
             self._save(state.FILE, asked.file())
         elif kind == "CSV":
-            self._save("page.csv", answers.records(curves))
+            self._save("page.csv", saved.records(curves))
         else:
-            threading.Thread(target=self._draw, args=(kind, asked, curves), daemon=True).start()
+            shown = Shown(curves, self._picture, self._loads, self._least_told)
+            threading.Thread(target=self._draw, args=(kind, asked, shown), daemon=True).start()
 
-    def _draw(self, kind: str, asked: PageInput, curves: list[Curve]) -> None:
+    def _draw(self, kind: str, asked: PageInput, shown: Shown) -> None:
         try:
-            text = answers.page_of(asked, curves) if kind == "Report" else answers.figure_of(asked, curves)
+            text = saved.page_of(asked, shown) if kind == "Report" else saved.figure_of(asked, shown.curves)
         except StochfuseError as error:
             said = escape(str(error))
             self._doc.add_next_tick_callback(lambda: setattr(self._status, "text", said))
@@ -617,14 +649,6 @@ def _number(field: str, text: str) -> float | None:
     if not isfinite(found):
         raise UsageError(f"{field}: expected a finite number, got '{text}'")
     return found
-
-
-def _value(line: Line) -> str:
-    """The last value of a line, with half the width of its band."""
-    text = f"{line.y[-1]:#.5g}"
-    if line.low is None or line.high is None:
-        return text
-    return f"{text} [{line.low[-1]:.5g}, {line.high[-1]:.5g}]"
 
 
 def _lines(text: str) -> str:

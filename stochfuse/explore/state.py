@@ -1,7 +1,7 @@
 """What is asked of the page: a scenario, what is changed in it, and what is to be shown.
 
-A `PageInput` is immutable, and from it comes everything else: the scenario, and the same question as commands, as
-Python and as a file.  What is opened in the page is content alone: a name in it never becomes a path (`opened`).
+An `Asked` is immutable, and from it comes everything else: the scenario, and the same question as commands, as Python
+and as a file.  What is opened in the page is content alone: a name in it never becomes a path (`opened`).
 """
 
 from __future__ import annotations
@@ -127,7 +127,8 @@ def opened(name: str, content: bytes, logs: Mapping[str, bytes]) -> Mapping[str,
 
 
 def _renamed(mapping: Mapping[str, Any], file: str) -> dict[str, Any]:
-    return {**mapping, "network": {**mapping["network"], "link": {"file": file}}}
+    network = mapping["network"]
+    return {**mapping, "network": {**network, "link": {**network.get("link", {}), "file": file}}}
 
 
 def _in_folder(name: str, content: bytes, use: Any) -> Any:
@@ -181,6 +182,7 @@ class PageInput:
     link : one probability for all links; None: the scenario's own.
     power : of all radios [dBm]; None: the scenario's.
     changed : probabilities of single links that were changed, by (receiver, sender) from 0.
+    sensors : what the R of single agents (from 0) is multiplied by; None: such an agent measures nothing.
     estimators : names.
     quantities : of the estimators.
     metric : its name; None: the scenario's, else trace.
@@ -198,6 +200,7 @@ class PageInput:
     link: float | None = None
     power: float | None = None
     changed: tuple[tuple[tuple[int, int], float], ...] = ()
+    sensors: tuple[tuple[int, float | None], ...] = ()
     estimators: tuple[str, ...] = (LFG,)
     quantities: tuple[str, ...] = ("claimed", "actual")
     metric: str | None = None
@@ -230,6 +233,8 @@ class PageInput:
             made = _loaded(OpenedScenario(self.given.name, put(made.to_mapping(), {POWER: self.power})))
         if self.changed:
             made = _loaded(OpenedScenario(self.given.name, self._with_changed(made)))
+        if self.sensors:
+            made = _loaded(OpenedScenario(self.given.name, self._with_sensors(made)))
         return made
 
     def _with_changed(self, made: Scenario) -> dict[str, Any]:
@@ -245,6 +250,30 @@ class PageInput:
         mapping = made.to_mapping()
         network = {key: value for key, value in mapping["network"].items() if key not in LINK_KEYS}
         return {**mapping, "network": {**network, "link": matrix.tolist()}}
+
+    def _with_sensors(self, made: Scenario) -> dict[str, Any]:
+        """A mapping in which single agents measure otherwise: their own R, or a named sensor's sigma."""
+        mapping = made.to_mapping()
+        mapping.setdefault("agent", [{} for _ in range(made.network.agents)])
+        model = mapping.get("model", {})
+        for i, times in self.sensors:
+            if i >= made.network.agents:
+                continue
+            table = mapping["agent"][i]
+            own = table.pop("sensor", True)
+            named = own if isinstance(own, dict) else model.get("sensor", {}) if "R" not in table else {}
+            R = table.get("R", model.get("R"))
+            if times is None:
+                mapping["agent"][i] = {**{k: v for k, v in table.items() if k not in ("H", "R")}, "sensor": False}
+                continue
+            if named:
+                sigma = {"sigma": (np.asarray(named["sigma"]) * np.sqrt(times)).tolist()} if "sigma" in named else {}
+                table["sensor"] = {**named, **sigma}
+            if "sigma" not in named and R is None:
+                raise UsageError(f"agent[{i + 1}].R: expected a sensor of its own or of the model, got none")
+            if "sigma" not in named:
+                table["R"] = (np.asarray(R) * times).tolist()
+        return mapping
 
     @cached_property
     def alike(self) -> Scenario:
@@ -280,12 +309,7 @@ class PageInput:
 
     def plain(self) -> bool:
         """Whether options say all that is changed."""
-        return not self.changed and self.given.name != FILE
-
-    def changing(self, **values: Any) -> PageInput:
-        """Return the same with something else asked; a change of size forgets changes of single links."""
-        forget = {"changed": ()} if {"given", "agents", "architecture", "link"} & set(values) else {}
-        return replace(self, **{**forget, **values})
+        return not self.changed and not self.sensors and self.given.name != FILE
 
     def file(self) -> str:
         """Return the scenario as a file."""
@@ -300,7 +324,7 @@ class PageInput:
                 counted = alone and method == "simplified" and self.scenario.network.counts is not None
                 more = ["--interval", "95%"] if counted else []
                 found.append(["predict", *base, *self._along(FINE, alone), "--method", method, *more, *shown])
-            for some, grid, runs in self._groups(sampled):
+            for some, grid, runs in self.groups(sampled):
                 more = [
                     "--quantity",
                     ",".join(self.quantities),
@@ -318,7 +342,7 @@ class PageInput:
         found.append(["messages", *present, *at])
         return [shlex.join(["stochfuse", *words]) for words in found]
 
-    def _groups(self, sampled: Sequence[str]) -> list[tuple[list[str], str, int]]:
+    def groups(self, sampled: Sequence[str]) -> list[tuple[list[str], str, int]]:
         """Estimators that are exact and those that are sampled, with their links and runs."""
         found = [([e for e in self.estimators if e not in sampled], COARSE, 0)]
         found.append(([e for e in self.estimators if e in sampled], ROUGH, RUNS))
@@ -361,7 +385,7 @@ class PageInput:
                 for method in ("simplified", "optimal")
             ),
         ]  # fmt: skip
-        for some, grid, runs in self._groups(sampled):
+        for some, grid, runs in self.groups(sampled):
             asks = f"estimators={some}, quantities={list(self.quantities)}{f', runs={runs}' if runs else ''}"
             lines.append(f"p = sf.compare_estimators(s, {asks}, {at(grid)})")
             lines += [f"print(p.values({q!r}{', ' + of if of else ''})[..., -1])" for q in self.quantities]
@@ -407,6 +431,8 @@ def field_of(error: Exception, otherwise: str = "scenario") -> str:
     """Return the field of the page that an error is about."""
     paths = [p.path for p in error.problems] if isinstance(error, ScenarioError) else []
     for text in (*paths, str(error)):
+        if text.startswith("agent["):
+            return "times"
         for key, field in FIELDS.items():
             if text == key or text.startswith((f"{key}:", f"{key} ", f"{key}.", f"{key}[")):
                 return field

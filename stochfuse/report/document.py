@@ -60,7 +60,8 @@ footer { margin-top: 2rem; color: #555; font-size: .85rem; }
 @page { size: A4; margin: 16mm 14mm; }
 @media print {
   body { font-size: 10pt; margin: 0; max-width: none; padding: 0; }
-  h2, dt { break-after: avoid; } figure, tr, dt { break-inside: avoid; } thead { display: table-header-group; }
+  h2, dt, .scroll div > div { break-after: avoid; }
+  figure, tr, dt { break-inside: avoid; } thead { display: table-header-group; }
   th, td { padding: .1rem .5rem; } .scroll { overflow: visible; } .screen { display: none; }
   figure svg, figure img { width: 100% !important; max-width: none !important; max-height: 120mm; }
 }
@@ -76,11 +77,13 @@ class DocumentNote(NamedTuple):
     words : of the command line that repeats it, without the program's name.
     scenario : with a scenario file's keys, and with what options changed in it.
     said : notes and warnings.
+    lines : several commands that repeat it, in the place of `words`.
     """
 
     words: Sequence[str]
     scenario: Mapping[str, Any]
     said: Sequence[str] = ()
+    lines: Sequence[str] = ()
 
 
 def document(report: Report, told: DocumentNote) -> str:
@@ -95,7 +98,7 @@ def document(report: Report, told: DocumentNote) -> str:
     tables = [tables] if isinstance(tables, Table) else list(tables)
     title = next((line for table in tables for line in table.title), "stochfuse")
     figure, why = _figure(report, title)
-    notes = [*told.said, *([why] if why else [])]
+    notes = [*(note.removeprefix("note: ") for note in told.said), *([why] if why else [])]
     parts = {
         "Result": f'<div class="scroll">{to_html(tables)}</div>',
         "Figure": figure,
@@ -162,7 +165,8 @@ def _words(tables: Sequence[Table], asked: Sequence[str]) -> str:
 
 def _again(told: DocumentNote) -> str:
     """The command that does it again."""
-    text = f"<pre>{escape(shlex.join(('stochfuse', *told.words)))}</pre>"
+    lines = told.lines or [shlex.join(("stochfuse", *told.words))]
+    text = f"<pre>{escape(chr(10).join(lines))}</pre>"
     if "-" in told.words:
         text += "<p>“-” is standard input.</p>"
     return text

@@ -289,8 +289,8 @@ def _of_columns(
         return _matrix(name, *rows)
     raise UsageError(
         f"{name}: expected columns seq, sender, receiver, received (a packet log) or receiver, sender, link (an edge "
-        f"list), or a matrix with names in its first row and column; got {', '.join(list(table)[:8])}; --columns "
-        "names others"
+        f"list), or a matrix with names in its first row and column; got {', '.join(list(table)[:8])}; --columns, "
+        "or in a scenario columns beside file, names others"
     )
 
 
@@ -356,10 +356,10 @@ def _torn(text: str, columns: int) -> str:
 def _renamed(name: str, table: dict[str, Any], columns: Mapping[str, str]) -> dict[str, Any]:
     for ours, theirs in columns.items():
         if ours not in COLUMNS:
-            raise UsageError(f"--columns: expected one of {', '.join(COLUMNS)}, got '{ours}'{nearest(ours, COLUMNS)}")
+            raise UsageError(f"columns: expected one of {', '.join(COLUMNS)}, got '{ours}'{nearest(ours, COLUMNS)}")
         if theirs not in table:
             raise UsageError(
-                f"--columns: {name} has no column '{theirs}'{nearest(theirs, table)}; it has {', '.join(table)}"
+                f"columns: {name} has no column '{theirs}'{nearest(theirs, table)}; it has {', '.join(table)}"
             )
     theirs = {given: ours for ours, given in columns.items()}
     return {theirs.get(head, head): column for head, column in table.items()}
@@ -380,6 +380,8 @@ def links_of_packets(table: Mapping[str, Any], *, source: str = "table", step: f
     """
     nodes, s, r = _nodes(source, table, "sender", "receiver")
     n = len(nodes)
+    if not n:
+        raise UsageError(f"{source}: expected packets, got no rows")
     seq = _numbers(source, table, "seq", whole=True) if "seq" in table else None
     notes = []
     if seq is not None:

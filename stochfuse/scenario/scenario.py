@@ -222,9 +222,13 @@ def with_links(mapping: Any, name: str, folder: Path) -> Any:
     if not isinstance(network, Mapping) or not (isinstance(given, Mapping) and isinstance(given.get("file"), str)):
         return mapping
     from stochfuse.scenario.links import as_network, read_links
+    from stochfuse.scenario.schema import LinkFile, problems_of
 
+    problems = problems_of(LinkFile, given)
+    if problems:
+        raise ScenarioError(name, [Problem(f"network.link.{p.path}", p.expected, p.got) for p in problems])
     try:
-        found = read_links(folder / given["file"])
+        found = read_links(folder / given["file"], columns=given.get("columns"))
     except UsageError as error:
         raise ScenarioError(name, [Problem("network.link.file", "a file of links", f"({error})")]) from None
     found = replace(found, source=given["file"])

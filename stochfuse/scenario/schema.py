@@ -231,6 +231,10 @@ class LinkFile(StrictTable):
     """Links from a packet log or a file of link probabilities."""
 
     file: str = Field(description="its path, relative to the scenario file; see `stochfuse links`")
+    columns: dict[str, str] | None = Field(
+        None,
+        description="its names of columns, by ours: { sender = 'src', receiver = 'dst' }; of seq, received, …",
+    )
 
 
 class RadioTable(StrictTable):

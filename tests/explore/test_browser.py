@@ -209,6 +209,26 @@ def test_a_link_is_explained_and_changed(window):
     assert found["scenario"]["network"]["link"][1][0] == 0.9
 
 
+def test_an_agent_is_explained_and_changed_and_changes_are_undone(window):
+    before = window.value()
+    window.field("Link or agent").select_option("agent 2")
+    window.page.get_by_text("Agent 2 measures with standard deviation 10").wait_for()
+    window.fill("its noise R, times", "0.25")
+    window.page.get_by_text("Agent 2 measures with standard deviation 5").wait_for()
+    window.done()
+    assert window.value() < before
+    _, text = window.saved("Save scenario")
+    found = strict_json(run("predict", "-", "--link", "0.5", "--format", "json", input=text).stdout)
+    assert window.value() == near(found["values"][0][-1])
+    window.page.get_by_role("checkbox", name="measures").press(" ")
+    window.page.get_by_text("Agent 2 measures nothing itself").wait_for()
+    window.done()
+    assert window.value() > before
+    window.page.get_by_role("button", name="Undo changes").press("Enter")
+    window.page.get_by_text("Agent 2 measures with standard deviation 10").wait_for()
+    assert window.value() == near(before)
+
+
 def test_a_scenario_and_a_packet_log_are_opened(window, tmp_path):
     mapping = sf.load_scenario("thesis-transient", steps=2).to_mapping()
     mapping["agent"] = [{"name": f"{SCRIPT}{i}"} for i in range(3)]

@@ -12,10 +12,11 @@ import pytest
 
 import stochfuse as sf
 from stochfuse.errors import ScenarioError, StochfuseError, UsageError
-from stochfuse.explore import answers
+from stochfuse.explore import answers, saved
 from stochfuse.explore.answers import QuestionWorker
 from stochfuse.explore.network import picture
-from stochfuse.explore.state import PageInput, begun, field_of, opened, preset, with_log
+from stochfuse.explore.saved import Shown
+from stochfuse.explore.state import OpenedScenario, PageInput, begun, field_of, opened, preset, with_log
 from stochfuse.scenario.as_toml import to_toml
 from tests.cli.command import run, strict_json
 
@@ -83,6 +84,10 @@ def test_the_rest_is_what_the_commands_print():
     ]
     assert load.value.mean(axis=1) == pytest.approx(means)
     assert "rank 1 of 6" in drawn.about_link((0, 1), question)
+    assert drawn.mended() == ""  # all are alike
+    one = answer(asked(steps=2, link=0.4, changed=(((0, 1), 0.9), ((1, 0), 0.1))), "sensitivity")
+    most = max(one.worth, key=lambda pair: -one.worth[pair] * (1 - one.link[pair]))
+    assert f"To mend first: {one.name(most)}; perfect" in one.mended()
     assert "hears 2 other(s), with µ = 0.4" in drawn.about_agent(0, question)
 
 
@@ -95,6 +100,36 @@ def test_a_file_says_all_that_was_changed(tmp_path):
     assert answer(question, "simplified")[0].steps.y.tolist() == found["values"][0]
 
 
+def test_single_agents_measure_otherwise(tmp_path):
+    question = asked(steps=2, link=0.4, sensors=((0, 0.25), (1, None), (7, None)))
+    given = {**preset("thesis-transient").mapping, "agent": [{"R": 25}, {"sensor": False}, {}]}
+    expected = sf.predict(given | {"network": {"agents": 3, "steps": 2}}, [0.4])
+    assert answer(question, "simplified")[0].steps.y[-1] == pytest.approx(expected.values()[0, -1])
+    (tmp_path / "page.toml").write_text(question.file())
+    assert all(" page.toml" in command for command in question.commands())
+    assert sf.load_scenario(tmp_path / "page.toml").sensors[0].R.tolist() == [[25.0]]
+    drawn = answer(question, "network")
+    assert "measures with standard deviation 5" in drawn.about_agent(0, question)
+    assert "measures nothing itself" in drawn.about_agent(1, question)
+    radar = asked("road-5", steps=2, sensors=((0, 9.0), (2, 1.0))).scenario
+    assert [np.diag(radar.sensors[i].R).tolist() for i in radar.sensor_of[:3]] == [[36.0, 36.0], [4.0, 4.0], [4.0, 4.0]]
+    named = asked("two-radars", sensors=((0, 4.0),)).scenario
+    assert np.allclose(
+        np.sqrt(np.diag(named.sensors[0].R[-1] if named.sensors[0].R.ndim == 3 else named.sensors[0].R)), [40, 0.02]
+    )
+    bare = OpenedScenario(
+        "x.toml",
+        given
+        | {
+            "model": {"F": 1, "Q": 1, "states": ["x"]},
+            "agent": [{"H": 1, "R": 1}, {"H": 1, "R": 1}, {"sensor": False}],
+        },
+    )
+    with pytest.raises(StochfuseError, match=r"agent\[3\]\.R: expected a sensor of its own or of the model") as error:
+        PageInput(bare, sensors=((2, 1.0),)).scenario  # noqa: B018
+    assert field_of(error.value) == "times"
+
+
 def test_python_runs_and_prints_the_same(capsys):
     question = asked(steps=2, link=0.4, agents=2, metric="std:x")
     exec(compile(question.python(), "page", "exec"), {})
@@ -104,15 +139,30 @@ def test_python_runs_and_prints_the_same(capsys):
 def test_csv_has_every_number():
     question = asked(steps=2, link=0.4)
     curves = [*answer(question, "simplified"), *answer(question, "estimator local-fusion-graph")]
-    lines = answers.records(curves).splitlines()
+    lines = saved.records(curves).splitlines()
     assert lines[0].startswith("series,method,quantity")
     assert len(lines) == 1 + 22 * 2 + 2 * 12 * 2
 
 
-def test_a_page_to_be_sent_repeats_the_command():
-    question = asked(steps=2, link=0.4)
-    page = answers.page_of(question, answer(question, "estimator local-fusion-graph"))
-    assert "stochfuse compare thesis-transient --steps 2 --link 0:1:0.1,0.4" in page
+def test_a_page_to_be_sent_has_all_that_is_shown():
+    question = asked(steps=2, link=0.4, target=50.0, sensors=((0, 4.0),), estimators=("local-fusion-graph", "naive"))
+    found = [answer(question, name) for name in ("simplified", "estimator local-fusion-graph", "estimator naive")]
+    found[2][0] = found[2][0]._replace(sampled=True)  # of other links than those that are exact
+    shown = Shown(
+        [c for some in found for c in some], *(answer(question, n) for n in ("sensitivity", "messages", "least"))
+    )
+    page = saved.page_of(question, shown)
+    assert "# page.toml is the scenario below\nstochfuse predict page.toml --link 0:1:0.05,0.4" in page
+    assert "stochfuse compare page.toml --link 0:1:0.1,0.4 --estimator local-fusion-graph" in page
+    for text in (
+        "What links are worth",
+        "1 → 2",
+        "Least µ for 50",
+        "Nodes new to an agent",
+        f"{found[0][0].steps.y[-1]:#.5g}",
+    ):
+        assert text in page
+    assert page.count("<svg") == 1
 
 
 def test_opened_files_are_content_alone(tmp_path):

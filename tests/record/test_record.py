@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+import stochfuse as sf
 from stochfuse.errors import UsageError
 from tests.record.__main__ import GROWN, REFUSED_NOW, TOLERANCE, answer, differences, recorded
 from tests.record.calls import calls
@@ -32,3 +36,16 @@ def test_a_difference_is_seen():
     assert differences({"a": 1}, {})[0][1] == np.inf
     assert differences([1.0, 1e-30], [1.0, 2e-30])[0][1] < 1e-12
     assert differences([1.0], [1.0, 2.0])[0][1] == np.inf
+
+
+NAMES = """AgentsNeeded Comparison FusionGraph LeastLink MessageLoad NoAnswerError Prediction Scenario ScenarioError
+    Sensitivity StochfuseError UsageError __version__ agents_needed check_results compare compare_estimators
+    derive_general derive_optimal derive_simplified least_link load_history load_scenario message_load predict
+    predict_many predict_states read_results sensitivity share_of_gain steady_state study"""
+
+
+def test_every_public_name_of_0_1_is_still_there_and_the_version_is_the_changelogs():
+    assert set(NAMES.split()) <= set(sf.__all__)
+    assert all(getattr(sf, name) is not None for name in NAMES.split())
+    headings = re.findall(r"^## (\S+)", (Path(__file__).parents[2] / "CHANGELOG.md").read_text(encoding="utf-8"), re.M)
+    assert headings[0] in ("Unreleased", sf.__version__)

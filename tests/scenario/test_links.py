@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import json
 import random
 from collections import defaultdict
 from itertools import pairwise
@@ -13,6 +14,7 @@ import pytest
 from scipy.stats import beta, chi2_contingency
 
 import stochfuse as sf
+from stochfuse.errors import ScenarioError, UsageError
 from stochfuse.scenario.links import read_links
 from tests.cli.command import run, strict_json
 
@@ -414,3 +416,31 @@ def test_the_figure_is_drawn(tmp_path):
     path = written(tmp_path, log_of([(k, s, r, int(k % 2)) for s in "abc" for r in "abc" if s != r for k in range(4)]))
     run("links", path, "--plot", tmp_path / "links.png")
     assert (tmp_path / "links.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_scenario_names_the_columns_of_its_file(tmp_path):
+    (tmp_path / "log.csv").write_text(
+        "n,tx,rx,ok\n" + "".join(f"{k},{s},{r},{k % 2}\n" for k in range(6) for s, r in ("ab", "ba"))
+    )
+    scenario = {"model": {"F": 1, "H": 1, "Q": 25, "R": 100}, "initial": {"P": 100}}
+    text = json.dumps(
+        scenario
+        | {
+            "network": {
+                "steps": 2,
+                "link": {
+                    "file": "log.csv",
+                    "columns": {"seq": "n", "sender": "tx", "receiver": "rx", "received": "ok"},
+                },
+            }
+        }
+    )
+    (tmp_path / "s.json").write_text(text)
+    assert np.array_equal(sf.load_scenario(tmp_path / "s.json").network.link, [[0, 0.5], [0.5, 0]])
+    for wrong, said in (('"oks"', "log.csv has no column 'oks'"), ("3", r"network\.link\.columns\.received: expected")):
+        (tmp_path / "s.json").write_text(text.replace('"ok"', wrong))
+        with pytest.raises(ScenarioError, match=said):
+            sf.load_scenario(tmp_path / "s.json")
+    (tmp_path / "none.csv").write_text("seq,sender,receiver,received\n")
+    with pytest.raises(UsageError, match=r"none\.csv: expected packets, got no rows"):
+        sf.links(tmp_path / "none.csv")
