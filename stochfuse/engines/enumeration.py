@@ -24,6 +24,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
+from functools import partial
 from itertools import combinations
 from typing import Any, NamedTuple, cast
 
@@ -41,7 +42,7 @@ MOST_CELLS = 1 << 21
 """Outcomes of one exchange up to which they are listed."""
 LONG = 1000
 """States from which on the work is long enough to be announced before."""
-LISTED = 1 << 20
+LISTED = 1 << 22
 """Weights of outcomes that are gone through at a time while equal claims are found."""
 MOST_WEIGHTS = 1 << 24
 """Weights of claims that are held at a time."""
@@ -435,10 +436,30 @@ class Claimed(NamedTuple):
     Parameters
     ----------
     terms : (sign, values (claims,)); the value −1 stands for nothing.
-    weights : weight of each claim for every group of agents, (groups, width, claims).
+    total : weight of each claim, without the last exchange, on the weights' axis, (width, claims).
+    shared : turns what is known on that axis, (width, ...), into the same for every group of agents with the last
+        exchange, (groups, full width, ...); linear, so that sums over claims may be taken first.
     """
 
     terms: tuple[tuple[int, np.ndarray], ...]
+    total: np.ndarray
+    shared: Callable[[np.ndarray], np.ndarray]
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Weight of each claim for every group of agents, (groups, full width, claims)."""
+        return self.shared(self.total)
+
+    def some(self, claims: slice) -> Claimed:
+        """Return some of the claims."""
+        return Claimed(tuple((sign, ids[claims]) for sign, ids in self.terms), self.total[:, claims], self.shared)
+
+
+class _Summed(NamedTuple):
+    """Different claims: numbers that tell them (1 or 2, claims), values (claims, terms), weights (claims, width)."""
+
+    keys: np.ndarray
+    ids: np.ndarray
     weights: np.ndarray
 
 
@@ -451,85 +472,88 @@ def claims_of(ending: Ending, signatures: np.ndarray | None, weights: Weights) -
         see `stochfuse.estimators.ledger.Ledger.signatures`; None where nothing is summed.
     """
     for view in ending.views:
-        gathered = _Gathered(view, ending, weights)
-        cells = len(view.terms[0][1])
-        factor_of = np.repeat(np.arange(len(view.factors)), np.diff([*view.starts, cells]))
-        width = ending.weights.shape[1] + view.factors.shape[1]
-        size = max(1, LISTED // (cells * width))
+        shared = partial(_shared, view.shares, ending.events, weights)
+        signs = [sign for sign, _ in view.terms]
+        width = weights.pairs(ending.weights[:1], view.factors).shape[-1]
+        size = max(1, LISTED // (len(view.terms[0][1]) * width))
+        parts: list[_Summed] = []
         for first in range(0, len(view.ids), size):
-            states = slice(first, first + size)
-            gathered.add(states, *_keys(view, states, signatures), factor_of)
-            if gathered.full:
-                yield gathered.claimed()
-                gathered = _Gathered(view, ending, weights)
-        if gathered.place:
-            yield gathered.claimed()
+            parts.append(_claimed(view, ending.weights, slice(first, first + size), signatures, weights))
+            # together as soon as the later parts are as large as the first: each claim is gone through a few times only
+            if sum(len(part.ids) for part in parts[1:]) >= len(parts[0].ids) or first + size >= len(view.ids):
+                parts = [_joined(parts)]
+            if parts[0].weights.size > MOST_WEIGHTS or first + size >= len(view.ids):
+                for part in parts:
+                    terms = tuple(zip(signs, part.ids.T, strict=True))
+                    yield Claimed(terms, np.ascontiguousarray(part.weights.T), shared)
+                parts = []
 
 
-def _keys(view: FusedSet, states: slice, signatures: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """One number for what is claimed in each outcome, (states · cells), equal where claims are, and their order."""
+def _shared(shares: Sequence[Any], events: int, weights: Weights, total: np.ndarray) -> np.ndarray:
+    """See `Claimed.shared`."""
+    by_group = [
+        None if share is None else weights.collected(weights.completed(weights.weighed(total, share), events))
+        for share in shares
+    ]
+    shape = next(part for part in by_group if part is not None).shape
+    return np.stack([np.zeros(shape) if part is None else part for part in by_group])
+
+
+def _claimed(
+    view: FusedSet, weight: np.ndarray, states: slice, signatures: np.ndarray | None, weights: Weights
+) -> _Summed:
+    """Different claims of some states' outcomes."""
+    keys, ids = _keys(view, states, signatures), view.ids[states]
+    cells = len(view.terms[0][1])
+    order, starts = _different(keys)
+    row, cell = np.divmod(order[starts], cells)
+    values = np.stack([ids[row, index[cell]] for _, index in view.terms], axis=-1)
+    factor_of = np.repeat(np.arange(len(view.factors)), np.diff([*view.starts, cells]))
+    pair_of = (np.arange(len(ids))[:, None] * len(view.factors) + factor_of).ravel()
+    pairs = weights.pairs(weight[states], view.factors)
+    total = _added(pairs.reshape(-1, pairs.shape[-1]), pair_of[order], starts)
+    return _Summed(keys[:, order[starts]], values, total)
+
+
+def _joined(parts: Sequence[_Summed]) -> _Summed:
+    """Claims of several parts, of equal ones one."""
+    if len(parts) == 1:
+        return parts[0]
+    keys = np.concatenate([part.keys for part in parts], axis=1)
+    order, starts = _different(keys)
+    total = _added(np.concatenate([part.weights for part in parts]), order, starts)
+    first = order[starts]
+    return _Summed(keys[:, first], np.concatenate([part.ids for part in parts])[first], total)
+
+
+def _added(rows: np.ndarray, which: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """Sums of rows, of those from each start to the next."""
+    from scipy.sparse import csr_array
+
+    matrix = csr_array((np.ones(len(which)), which, [*starts, len(which)]), shape=(len(starts), len(rows)))
+    return matrix @ rows
+
+
+def _keys(view: FusedSet, states: slice, signatures: np.ndarray | None) -> np.ndarray:
+    """Numbers for what is claimed in each outcome, (1 or 2, states · cells), equal where claims are."""
     ids = view.ids[states]
     if len(view.terms) == 1 or signatures is None:
         ((_, index),) = view.terms
-        keys = ids[:, index].ravel()
-        return keys, np.argsort(keys)
-    keys = np.zeros((len(ids), len(view.terms[0][1]), 2), dtype=np.uint64)
+        return ids[:, index].reshape(1, -1)
+    numbers = np.moveaxis(signatures[ids], -1, 0)
+    keys = np.zeros((2, len(ids), len(view.terms[0][1])), dtype=np.uint64)
     for sign, index in view.terms:
-        part = signatures[ids[:, index]]
-        (np.add if sign > 0 else np.subtract)(keys, part, out=keys)
-    keys = keys.reshape(-1, 2)
-    first = np.ascontiguousarray(keys[:, 0])
+        (np.add if sign > 0 else np.subtract)(keys, numbers.take(index, axis=2), out=keys)
+    return keys.reshape(2, -1)
+
+
+def _different(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Order of keys (1 or 2, keys), and where the different ones begin in it."""
+    order = np.argsort(keys[0])
+    first, last = keys[0][order], keys[-1][order]
+    new, other = first[1:] != first[:-1], last[1:] != last[:-1]
     # two different claims share a number once in 10^19 pairs: where the second number differs, both count
-    order = np.argsort(first)
-    one, other = first[order], keys[order, 1]
-    if not ((one[1:] == one[:-1]) & (other[1:] != other[:-1])).any():
-        return first, order
-    both = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
-    return both, np.argsort(both)
-
-
-class _Gathered:
-    """Claims of a view with their weights, while states are gone through."""
-
-    def __init__(self, view: FusedSet, ending: Ending, weights: Weights) -> None:
-        self.view, self.ending, self.weights = view, ending, weights
-        self.place: dict[int, int] = {}
-        self._ids: list[np.ndarray] = []
-        self._total = np.zeros((0, 0))
-
-    @property
-    def full(self) -> bool:
-        """Whether the weights take as much memory as they may."""
-        return len(self.place) * self._total.shape[1] > MOST_WEIGHTS
-
-    def add(self, states: slice, keys: np.ndarray, order: np.ndarray, factor_of: np.ndarray) -> None:
-        """Add up the weights of some states' outcomes, (states · cells), in the order of their keys."""
-        view, sorted_keys = self.view, keys[order]
-        starts = np.flatnonzero(np.concatenate([[True], sorted_keys[1:] != sorted_keys[:-1]]))
-        before = len(self.place)
-        at = np.array([self.place.setdefault(key, len(self.place)) for key in sorted_keys[starts].tolist()])
-        row, cell = np.divmod(order[starts[at >= before]], len(factor_of))
-        self._ids.append(np.stack([view.ids[states][row, index[cell]] for _, index in view.terms], axis=-1))
-        pairs = self.weights.pairs(self.ending.weights[states], view.factors)
-        pair_of = (np.arange(len(keys) // len(factor_of))[:, None] * len(view.factors) + factor_of).ravel()
-        part = np.add.reduceat(pairs.reshape(-1, pairs.shape[-1])[pair_of[order]], starts, axis=0)
-        self._grow(part.shape[1])
-        self._total[at] += part
-
-    def _grow(self, width: int) -> None:
-        if len(self.place) > len(self._total):
-            more = np.zeros((max(len(self.place), 2 * len(self._total)), width))
-            more[: len(self._total), : self._total.shape[1]] = self._total
-            self._total = more
-
-    def claimed(self) -> Claimed:
-        """Return the claims with their weights for every group of agents."""
-        weights, events = self.weights, self.ending.events
-        ids, total = np.concatenate(self._ids), self._total[: len(self.place)].T
-        by_group = []
-        for share in self.view.shares:
-            part = None if share is None else weights.completed(weights.weighed(total, share), events)
-            by_group.append(None if part is None else weights.collected(part))
-        shape = next(part for part in by_group if part is not None).shape
-        stacked = np.stack([np.zeros(shape) if part is None else part for part in by_group])
-        return Claimed(tuple((sign, ids[:, t]) for t, (sign, _) in enumerate(self.view.terms)), stacked)
+    if (other & ~new).any():
+        order = np.lexsort(keys[::-1])
+        new = (keys[:, order[1:]] != keys[:, order[:-1]]).any(axis=0)
+    return order, np.flatnonzero(np.concatenate([[True], new]))

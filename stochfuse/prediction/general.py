@@ -117,23 +117,19 @@ class Enumerated:
             held, numbers = [], 0
             for block in found:
                 held.append(block)
-                numbers += block.weights.size
+                numbers += block.total.size
                 if numbers > HELD:
                     return _rest(held, found)
             self._held[step] = held
         return self._held[step]
 
-    def shared_out(self, step: int, values: Claims) -> Iterator[tuple[np.ndarray, Any, Any]]:
-        """Claims of a step in numbers, some at a time: weights (groups, width, claims), estimates, and by how much
-        rounding grew in them.
-        """
+    def shared_out(self, step: int, values: Claims) -> Iterator[tuple[Claimed, Any, Any]]:
+        """Claims of a step in numbers, some at a time: claims, estimates, and by how much rounding grew in them."""
+        size = max(1, CHUNK // values.width)
         for block in self.claims(step):
-            claims = block.weights.shape[2]
-            size = max(1, CHUNK // values.width)
-            for first in range(0, claims, size):
-                some = slice(first, first + size)
-                estimate, grown = values.estimate([(sign, ids[some]) for sign, ids in block.terms], step)
-                yield block.weights[:, :, some], estimate, grown
+            for first in range(0, block.total.shape[1], size):
+                some = block.some(slice(first, first + size))
+                yield some, *values.estimate(some.terms, step)
 
 
 def _rest(held: list[Claimed], found: Iterator[Claimed]) -> Iterator[Claimed]:
@@ -312,7 +308,7 @@ class Outcomes:
     def _kept(self) -> np.ndarray:
         """Probability of the outcomes that were not left out, (rows, steps)."""
         steps = range(1, self.system.steps + 1)
-        by_step = [sum(block.weights[0].sum(axis=-1) for block in self.found.claims(step)) for step in steps]
+        by_step = [sum(b.shared(b.total.sum(axis=-1))[0] for b in self.found.claims(step)) for step in steps]
         return np.stack(by_step, axis=1)
 
     def statistic(self, name: str, metric: Metric, groups: Sequence[int], quantity: str = "claimed") -> np.ndarray:
@@ -358,7 +354,7 @@ class Outcomes:
 
     def _blocks_of_rows(self, step: int) -> list[slice]:
         """Rows in blocks small enough that a distribution of each fits in memory."""
-        rows, claims = len(self.links.link), sum(block.weights.shape[2] for block in self.found.claims(step))
+        rows, claims = len(self.links.link), sum(block.total.shape[1] for block in self.found.claims(step))
         size = max(1, MOST_PROBABILITIES // claims)
         return [slice(first, first + size) for first in range(0, rows, size)]
 
@@ -377,8 +373,8 @@ class Outcomes:
         agents = sum(len(self.groups[g]) for g in groups)
         share = np.array([len(self.groups[g]) / agents for g in groups])
         values, weights = [], []
-        for by_group, estimate, _ in self.found.shared_out(step, self.values):
-            weight = np.tensordot(share, by_group[list(groups)], axes=1)
+        for claims, estimate, _ in self.found.shared_out(step, self.values):
+            weight = np.tensordot(share, claims.weights[list(groups)], axes=1)
             some = np.flatnonzero(weight.any(axis=0))
             if not len(some):
                 continue
@@ -395,10 +391,11 @@ class Outcomes:
     def listed(self, step: int, group: int) -> tuple[Callable[[int], np.ndarray], Moments]:
         """What gives the probability of every outcome of a step in a row, and an agent's moments in each."""
         weights, found = [], []
-        for by_group, estimate, _ in self.found.shared_out(step, self.values):
-            some = np.flatnonzero(by_group[group].any(axis=0))
+        for claims, estimate, _ in self.found.shared_out(step, self.values):
+            weight = claims.weights[group]
+            some = np.flatnonzero(weight.any(axis=0))
             found.append((moments if self.errors else claimed_only)(estimate).map(lambda M: M[some]))  # noqa: B023
-            weights.append(by_group[group][:, some])
+            weights.append(weight[:, some])
 
         def probability(row: int) -> np.ndarray:
             p = np.concatenate([self._probability(weight, slice(row, row + 1))[0] for weight in weights])
@@ -419,9 +416,7 @@ class Outcomes:
         return bernstein(expected, len(expected) - 1, self.common if link is None else link)
 
 
-def _expectation(
-    claims: Iterable[tuple[np.ndarray, Any, Any]], of: Callable[[Estimate], Any]
-) -> tuple[list[Any], float]:
+def _expectation(claims: Iterable[tuple[Claimed, Any, Any]], of: Callable[[Estimate], Any]) -> tuple[list[Any], float]:
     """Expected state and covariance per group of agents, (48)/(49), on the weights' axis, and growth of rounding.
 
     Parameters
@@ -429,16 +424,16 @@ def _expectation(
     of : makes what is averaged, a named tuple of arrays or Nones, of a stack of estimates.
     """
     magnified, total, kind = 1.0, {}, None
-    groups = 0
-    for weights, estimate, grown in claims:
-        magnified, averaged, groups = max(magnified, float(grown)), of(estimate), len(weights)
+    for some, estimate, grown in claims:
+        magnified, averaged = max(magnified, float(grown)), of(estimate)
         kind = type(averaged)
         for place, values in enumerate(averaged):
             if values is not None:
-                part = np.tensordot(weights, values, axes=1)
+                part = some.shared(np.tensordot(some.total, values, axes=1))
                 total[place] = total[place] + part if place in total else part
     if kind is None:
         raise StochfuseError("no outcome is possible")
+    groups = len(next(iter(total.values())))
     by_group = [
         [total[place][g] if place in total else None for place in range(len(kind._fields))] for g in range(groups)
     ]
@@ -704,7 +699,8 @@ class _Batch(NamedTuple):
         magnified, steps = np.ones(len(of)), []
         for step in range(1, self.system.steps + 1):
             expected: list[Any] = [None] * len(Moments._fields)
-            for weights, estimate, grown in self.found.shared_out(step, values):
+            for claims, estimate, grown in self.found.shared_out(step, values):
+                weights = claims.weights
                 magnified = np.maximum(magnified, np.atleast_1d(grown)[of])
                 probability = monomials(weights.shape[1] - 1, link) @ weights
                 for place, each in enumerate((moments if self.errors else claimed_only)(estimate)):
