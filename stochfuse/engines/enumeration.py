@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
-from functools import partial
+from functools import cached_property
 from itertools import combinations
 from typing import Any, NamedTuple, cast
 
@@ -42,10 +42,8 @@ MOST_CELLS = 1 << 21
 """Outcomes of one exchange up to which they are listed."""
 LONG = 1000
 """States from which on the work is long enough to be announced before."""
-LISTED = 1 << 22
-"""Weights of outcomes that are gone through at a time while equal claims are found."""
-MOST_WEIGHTS = 1 << 24
-"""Weights of claims that are held at a time."""
+LISTED = 1 << 21
+"""Outcomes, or weights of some, that are gone through at a time while equal claims are found."""
 MOST_ENDINGS = 1_000_000
 """Outcomes of the last exchange, over all states, up to which they are listed one by one."""
 WRITTEN_OUT = 10**30
@@ -430,37 +428,80 @@ class _Table:
         return [*locals_, *reversed(brought), -1]
 
 
-class Claimed(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Claimed:
     """Different claims of a step, outcomes with equal ones added up: Y = Σ sign · Y[ids].
 
     Parameters
     ----------
     terms : (sign, values (claims,)); the value −1 stands for nothing.
-    total : weight of each claim, without the last exchange, on the weights' axis, (width, claims).
-    shared : turns what is known on that axis, (width, ...), into the same for every group of agents with the last
-        exchange, (groups, full width, ...); linear, so that sums over claims may be taken first.
+    which : number of the claim in every outcome, (states, cells).
+    view : the outcomes.
+    states : weight of every state, on the weights' axis.
+    events : events up to the step.
+    bookkeeping : of the weights.
     """
 
     terms: tuple[tuple[int, np.ndarray], ...]
-    total: np.ndarray
-    shared: Callable[[np.ndarray], np.ndarray]
+    which: np.ndarray
+    view: FusedSet
+    states: np.ndarray
+    events: int
+    bookkeeping: Weights
 
     @property
-    def weights(self) -> np.ndarray:
-        """Weight of each claim for every group of agents, (groups, full width, claims)."""
-        return self.shared(self.total)
+    def number(self) -> int:
+        """How many claims there are."""
+        return len(self.terms[0][1])
 
-    def some(self, claims: slice) -> Claimed:
-        """Return some of the claims."""
-        return Claimed(tuple((sign, ids[claims]) for sign, ids in self.terms), self.total[:, claims], self.shared)
+    @cached_property
+    def width(self) -> int:
+        """Length of the weights' axis before the last exchange counts."""
+        return self.bookkeeping.pairs(self.states[:1], self.view.factors).shape[2]
 
+    @cached_property
+    def total(self) -> np.ndarray:
+        """Weight of each claim before the last exchange counts, (width, claims); see `shared`."""
+        from scipy.sparse import csr_array
 
-class _Summed(NamedTuple):
-    """Different claims: numbers that tell them (1 or 2, claims), values (claims, terms), weights (claims, width)."""
+        total, factor_of = np.zeros((self.number, self.width)), self._factor_of
+        for some, pairs in self._pairs():
+            which = self.which[some].ravel()
+            pair_of = (np.arange(len(pairs))[:, None] * pairs.shape[1] + factor_of).ravel()
+            places = (np.ones(len(which)), (which, pair_of))
+            total += csr_array(places, shape=(self.number, pairs[:, :, 0].size)) @ pairs.reshape(-1, self.width)
+        return np.ascontiguousarray(total.T)
 
-    keys: np.ndarray
-    ids: np.ndarray
-    weights: np.ndarray
+    def expected(self, values: np.ndarray) -> np.ndarray:
+        """Σ weight · values (claims, numbers) for every group of agents, (groups, full width, numbers).
+
+        Without the weight of any claim: for few numbers of many claims.
+        """
+        found = np.zeros((self.width, values.shape[1]))
+        for some, pairs in self._pairs():
+            by_factor = np.add.reduceat(values[self.which[some]], self.view.starts, axis=1)
+            found += np.tensordot(pairs, by_factor, axes=((0, 1), (0, 1)))
+        return self.shared(found)
+
+    def shared(self, found: np.ndarray) -> np.ndarray:
+        """What is known before the last exchange counts, (width, ...), after it: (groups, full width, ...)."""
+        weights, by_group = self.bookkeeping, []
+        for share in self.view.shares:
+            whole = None if share is None else weights.completed(weights.weighed(found, share), self.events)
+            by_group.append(None if whole is None else weights.collected(whole))
+        shape = next(part for part in by_group if part is not None).shape
+        return np.stack([np.zeros(shape) if part is None else part for part in by_group])
+
+    @property
+    def _factor_of(self) -> np.ndarray:
+        return np.repeat(np.arange(len(self.view.factors)), np.diff([*self.view.starts, self.which.shape[1]]))
+
+    def _pairs(self) -> Iterator[tuple[slice, np.ndarray]]:
+        """Weights of some states with every factor, (states, factors, width), at a time."""
+        size = max(1, LISTED // max(self.which.shape[1], len(self.view.factors) * self.width))
+        for first in range(0, len(self.which), size):
+            some = slice(first, first + size)
+            yield some, self.bookkeeping.pairs(self.states[some], self.view.factors)
 
 
 def claims_of(ending: Ending, signatures: np.ndarray | None, weights: Weights) -> Iterator[Claimed]:
@@ -472,66 +513,16 @@ def claims_of(ending: Ending, signatures: np.ndarray | None, weights: Weights) -
         see `stochfuse.estimators.ledger.Ledger.signatures`; None where nothing is summed.
     """
     for view in ending.views:
-        shared = partial(_shared, view.shares, ending.events, weights)
-        signs = [sign for sign, _ in view.terms]
-        width = weights.pairs(ending.weights[:1], view.factors).shape[-1]
-        size = max(1, LISTED // (len(view.terms[0][1]) * width))
-        parts: list[_Summed] = []
+        cells = len(view.terms[0][1])
+        size = max(1, LISTED // cells)
         for first in range(0, len(view.ids), size):
-            parts.append(_claimed(view, ending.weights, slice(first, first + size), signatures, weights))
-            # together as soon as the later parts are as large as the first: each claim is gone through a few times only
-            if sum(len(part.ids) for part in parts[1:]) >= len(parts[0].ids) or first + size >= len(view.ids):
-                parts = [_joined(parts)]
-            if parts[0].weights.size > MOST_WEIGHTS or first + size >= len(view.ids):
-                for part in parts:
-                    terms = tuple(zip(signs, part.ids.T, strict=True))
-                    yield Claimed(terms, np.ascontiguousarray(part.weights.T), shared)
-                parts = []
-
-
-def _shared(shares: Sequence[Any], events: int, weights: Weights, total: np.ndarray) -> np.ndarray:
-    """See `Claimed.shared`."""
-    by_group = [
-        None if share is None else weights.collected(weights.completed(weights.weighed(total, share), events))
-        for share in shares
-    ]
-    shape = next(part for part in by_group if part is not None).shape
-    return np.stack([np.zeros(shape) if part is None else part for part in by_group])
-
-
-def _claimed(
-    view: FusedSet, weight: np.ndarray, states: slice, signatures: np.ndarray | None, weights: Weights
-) -> _Summed:
-    """Different claims of some states' outcomes."""
-    keys, ids = _keys(view, states, signatures), view.ids[states]
-    cells = len(view.terms[0][1])
-    order, starts = _different(keys)
-    row, cell = np.divmod(order[starts], cells)
-    values = np.stack([ids[row, index[cell]] for _, index in view.terms], axis=-1)
-    factor_of = np.repeat(np.arange(len(view.factors)), np.diff([*view.starts, cells]))
-    pair_of = (np.arange(len(ids))[:, None] * len(view.factors) + factor_of).ravel()
-    pairs = weights.pairs(weight[states], view.factors)
-    total = _added(pairs.reshape(-1, pairs.shape[-1]), pair_of[order], starts)
-    return _Summed(keys[:, order[starts]], values, total)
-
-
-def _joined(parts: Sequence[_Summed]) -> _Summed:
-    """Claims of several parts, of equal ones one."""
-    if len(parts) == 1:
-        return parts[0]
-    keys = np.concatenate([part.keys for part in parts], axis=1)
-    order, starts = _different(keys)
-    total = _added(np.concatenate([part.weights for part in parts]), order, starts)
-    first = order[starts]
-    return _Summed(keys[:, first], np.concatenate([part.ids for part in parts])[first], total)
-
-
-def _added(rows: np.ndarray, which: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Sums of rows, of those from each start to the next."""
-    from scipy.sparse import csr_array
-
-    matrix = csr_array((np.ones(len(which)), which, [*starts, len(which)]), shape=(len(starts), len(rows)))
-    return matrix @ rows
+            states = slice(first, first + size)
+            order, starts = _different(_keys(view, states, signatures))
+            which = np.empty(len(order), dtype=np.int32)
+            which[order] = np.repeat(np.arange(len(starts)), np.diff([*starts, len(order)]))
+            row, cell = np.divmod(order[starts], cells)
+            terms = tuple((sign, view.ids[states][row, index[cell]]) for sign, index in view.terms)
+            yield Claimed(terms, which.reshape(-1, cells), view, ending.weights[states], ending.events, weights)
 
 
 def _keys(view: FusedSet, states: slice, signatures: np.ndarray | None) -> np.ndarray:

@@ -18,6 +18,7 @@ Values under numbers, when agents of one kind change places: what ledgers of sum
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -155,8 +156,8 @@ class Ledger(Renamed):
     def table(self, values: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Sums of values (default: all): atoms and coefficients one after the other, and where each sum begins."""
         sums = self.sums if values is None else [self.sums[value] for value in values]
-        which, times = np.array([pair for sum_ in sums for pair in sum_], dtype=int).reshape(-1, 2).T
-        first = np.cumsum([0] + [len(sum_) for sum_ in sums[:-1]])
+        which, times = np.fromiter(chain.from_iterable(chain.from_iterable(sums)), dtype=int).reshape(-1, 2).T
+        first = np.cumsum([0, *map(len, sums)])[:-1]
         return which, times, first
 
     def _renamed(self, value: int, into: Ledger, names: Sequence[int], known: dict[int, int]) -> int:
@@ -330,9 +331,6 @@ class InformationClaims:
         self.information, y = information, information.y
         items = information.Y[0].size // d**2
         self.width = items * d * max(d, 0 if y is None else y.shape[-1])
-        # the last entry, −1, stands for nothing
-        self._Y = np.concatenate([information.Y, np.zeros_like(information.Y[:1])])
-        self._y = None if y is None else np.concatenate([y, np.zeros_like(y[:1])])
 
     def estimate(self, terms: Sequence[tuple[int, np.ndarray]], step: int) -> tuple[Estimate, np.ndarray]:
         """Estimates of a step from sums of values, and by how much rounding grew, for each item of a batch.
@@ -342,10 +340,21 @@ class InformationClaims:
         NoAnswerError
             If some sum is no positive-definite information.
         """
-        Y: Any = sum(sign * self._Y[values] for sign, values in terms)
-        y = None if self._y is None else sum(sign * self._y[values] for sign, values in terms)
-        estimate, magnified = estimated(Information(y, Y), step)
+        y, Y = self.information
+        found = Information(None if y is None else _summed(y, terms), _summed(Y, terms))
+        estimate, magnified = estimated(found, step)
         return estimate, magnified.max(axis=(0, -1))
+
+
+def _summed(numbers: np.ndarray, terms: Sequence[tuple[int, np.ndarray]]) -> np.ndarray:
+    """Σ sign · numbers[values] over (sign, values of any one shape); the value −1 stands for nothing."""
+    (_, first), *others = terms
+    total = numbers.take(first, axis=0)
+    total[first < 0] = 0.0
+    for sign, values in others:
+        here = np.nonzero(values >= 0)
+        total[here] += sign * numbers.take(values[here], axis=0)
+    return total
 
 
 def estimated(information: Information, step: int) -> tuple[Estimate, np.ndarray]:

@@ -314,8 +314,8 @@ def time_average(rms: np.ndarray) -> np.ndarray:
 def _averages(found: Outcomes, step: int) -> Averages:
     """Average a step over the outcomes, of which all agents are alike."""
     least, most, total = np.inf, 0.0, [0.0, 0.0, 0.0]
-    for claims, estimate, _ in found.found.shared_out(step, found.values):
-        P, weight = estimate.P[..., 0], claims.weights[0]
+    for weights, estimate, _ in found.found.shared_out(step, found.values):
+        P, weight = estimate.P[..., 0], weights[0]
         least, most = min(least, P.min()), max(most, P.max())
         x = np.zeros((len(P), 0)) if estimate.x is None else estimate.x[:, 0]
         parts = [weight @ P, weight @ x, np.stack([(w[:, None] * x).T @ x for w in weight])]
