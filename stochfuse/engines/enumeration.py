@@ -33,6 +33,7 @@ import numpy as np
 from stochfuse.engines.events import Event, Outcome, Rows, Weights, concerning, number_of_outcomes, outcomes
 from stochfuse.engines.progress import listener, uncollected
 from stochfuse.errors import TooManyError
+from stochfuse.estimators.ledger import different
 from stochfuse.estimators.protocol import AdditiveEstimator, Estimator
 from stochfuse.scenario.system import Detection
 
@@ -42,6 +43,10 @@ MOST_CELLS = 1 << 21
 """Outcomes of one exchange up to which they are listed."""
 LONG = 1000
 """States from which on the work is long enough to be announced before."""
+TOGETHER = 1 << 12
+"""States whose last two exchanges are gone through at a time."""
+AT_A_TIME = 1 << 17
+"""Outcomes of states, in every order of the agents, that are merged at a time."""
 LISTED = 1 << 21
 """Outcomes, or weights of some, that are gone through at a time while equal claims are found."""
 MOST_ENDINGS = 1_000_000
@@ -203,19 +208,44 @@ def _next_layer(
     request: Request,
 ) -> dict[Any, Any]:
     times, found = request.weights.times, {}
-    total, progress = len(layer), listener()
-    for done, (state, weight) in enumerate(layer.items()):
-        exchange = state if request.plain else estimator.exchange(state)
-        for outcome in possible:
-            if request.plain:
-                after = exchange.onward(outcome.heard, outcome.late, outcome.missed)
-            else:
-                after, _ = exchange.after(outcome.heard, outcome.late, outcome.missed)
-            new = times(weight, outcome.factor)
-            known = found.get(after)
-            found[after] = new if known is None else known + new
-        progress.advance(f"step {step}", done + 1, total)
+    total, progress, done = len(layer), listener(), 0
+    for states, weights, exchanges in _in_parts(estimator, layer, possible, request):
+        if exchanges is None:
+            for state, weight in zip(states, weights, strict=True):
+                exchange = state if request.plain else estimator.exchange(state)
+                for outcome in possible:
+                    if request.plain:
+                        after = exchange.onward(outcome.heard, outcome.late, outcome.missed)
+                    else:
+                        after, _ = exchange.after(outcome.heard, outcome.late, outcome.missed)
+                    new = times(weight, outcome.factor)
+                    known = found.get(after)
+                    found[after] = new if known is None else known + new
+                done += 1
+                progress.advance(f"step {step}", done, total)
+            continue
+        which, after = exchanges.after(np.array([outcome.heard for outcome in possible]))
+        for weight, numbers in zip(weights, which.tolist(), strict=True):
+            for outcome, number in zip(possible, numbers, strict=True):
+                new = times(weight, outcome.factor)
+                known = found.get(after[number])
+                found[after[number]] = new if known is None else known + new
+        done += len(states)
+        progress.advance(f"step {step}", done, total)
     return found
+
+
+def _in_parts(
+    estimator: Estimator, layer: dict[Any, Any], possible: list[Outcome], request: Request
+) -> Iterator[tuple[list[Any], list[Any], Any]]:
+    """States with weights, and their exchanges many at a time, None where they are gone through one by one."""
+    states, weights = list(layer), list(layer.values())
+    plain = request.plain or not estimator.additive or any(outcome.late or outcome.missed for outcome in possible)
+    size = max(1, AT_A_TIME // (len(possible) * len(estimator.relabellings)))
+    for first in range(0, len(states), size):
+        some = states[first : first + size]
+        together = None if plain else cast(AdditiveEstimator, estimator).together(some)
+        yield some, weights[first : first + size], together
 
 
 def _likeliest(layer: dict[Any, np.ndarray], request: Request) -> dict[Any, np.ndarray]:
@@ -314,7 +344,7 @@ def _two_step_ending(
 ) -> Ending:
     """The last two exchanges for every state, through the lattice of what can be common."""
     weights, n = request.weights, request.agents
-    table = _Table(estimator, n)
+    table = _LastViews(estimator, n)
     views = []
     sets = _last_heard(last, request)
     most = max(len(concerning(before, _members(fused, n))) for fused in sets)
@@ -335,11 +365,16 @@ def _two_step_ending(
             sign = 1 if size % 2 else -1
             terms += [(sign, table.common([heard[i] for i in T])) for T in combinations(members, size)]
         views.append((terms, starts, factors, shares))
-    ids, progress = [], listener()
-    for done, state in enumerate(layer, start=1):
-        ids.append(table.values(estimator.exchange(state)))
-        progress.advance(f"steps {step - 1} and {step}", done, len(layer))
-    ids = np.array(ids)
+    ids, progress, states = [], listener(), list(layer)
+    for first in range(0, len(states), TOGETHER):
+        some = states[first : first + TOGETHER]
+        exchanges = estimator.together(some)
+        if exchanges is not None:
+            ids.append(table.values_of(exchanges))
+        else:
+            ids.append(np.array([table.values(estimator.exchange(state)) for state in some]))
+        progress.advance(f"steps {step - 1} and {step}", first + len(some), len(states))
+    ids = np.concatenate(ids)
     made = [FusedSet(ids, tuple((s, i) for s, i in terms if i is not None), *rest) for terms, *rest in views]
     return Ending(step, weights.table(list(layer.values()), degree), made, events)
 
@@ -384,7 +419,7 @@ def _cells(
     return heard, successes, np.eye(len(drawn) + 1)
 
 
-class _Table:
+class _LastViews:
     """Numbers the local estimates and the common pedigrees that the views of a step need."""
 
     def __init__(self, estimator: AdditiveEstimator, agents: int) -> None:
@@ -426,6 +461,16 @@ class _Table:
         commons = [exchange.common(clauses) for clauses in self._clauses]
         brought = [-1 if value is None else ledger.forward(value, step) for value in commons]
         return [*locals_, *reversed(brought), -1]
+
+    def values_of(self, exchanges: Any) -> np.ndarray:
+        """Values of many states, (states, values), as `values` has those of one."""
+        ledger, pairs = self.estimator.ledger, list(self._locals)
+        heard = sorted({h for _, h in pairs})
+        unions = exchanges.unions(heard)
+        fused = dict(zip(heard, unions.T, strict=True))
+        locals_ = [ledger.locals(fused[h], source) for source, h in pairs]
+        commons = ledger.forwards(exchanges.commons(self._clauses), int(ledger.steps[locals_[0][0]]))
+        return np.stack([*locals_, *commons.T[::-1], np.full(len(unions), -1)], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -517,7 +562,7 @@ def claims_of(ending: Ending, signatures: np.ndarray | None, weights: Weights) -
         size = max(1, LISTED // cells)
         for first in range(0, len(view.ids), size):
             states = slice(first, first + size)
-            order, starts = _different(_keys(view, states, signatures))
+            order, starts = different(_keys(view, states, signatures))
             which = np.empty(len(order), dtype=np.int32)
             which[order] = np.repeat(np.arange(len(starts)), np.diff([*starts, len(order)]))
             row, cell = np.divmod(order[starts], cells)
@@ -536,15 +581,3 @@ def _keys(view: FusedSet, states: slice, signatures: np.ndarray | None) -> np.nd
     for sign, index in view.terms:
         (np.add if sign > 0 else np.subtract)(keys, numbers.take(index, axis=2), out=keys)
     return keys.reshape(2, -1)
-
-
-def _different(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Order of keys (1 or 2, keys), and where the different ones begin in it."""
-    order = np.argsort(keys[0])
-    first, last = keys[0][order], keys[-1][order]
-    new, other = first[1:] != first[:-1], last[1:] != last[:-1]
-    # two different claims share a number once in 10^19 pairs: where the second number differs, both count
-    if (other & ~new).any():
-        order = np.lexsort(keys[::-1])
-        new = (keys[:, order[1:]] != keys[:, order[:-1]]).any(axis=0)
-    return order, np.flatnonzero(np.concatenate([[True], new]))

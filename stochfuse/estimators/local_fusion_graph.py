@@ -29,8 +29,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from stochfuse.errors import TooManyError
+from stochfuse.estimators.layers import GraphLayer
 from stochfuse.estimators.ledger import COMMON, Ledger
-from stochfuse.estimators.protocol import FusionRule, Late, best_relabelling
+from stochfuse.estimators.protocol import AdditiveLayer, FusionRule, Late, best_relabelling
 
 
 class Agent(NamedTuple):
@@ -163,6 +164,10 @@ class LocalFusionGraph(FusionRule):
         """Open the exchange of the state's step."""
         values, below = [value for value, _ in state.nodes], [below for _, below in state.nodes]
         return GraphExchange(self, Pedigrees(self.ledger, values, below), state.agents, state.late)
+
+    def together(self, states: Sequence[GraphState]) -> AdditiveLayer | None:
+        """Open the exchanges of many states, where they can stand in arrays."""
+        return GraphLayer(self, states) if GraphLayer.fits(self, states) else None
 
     def rests_on(self, state: GraphState) -> Iterator[int]:
         """Values that a state rests on."""

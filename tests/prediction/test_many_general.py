@@ -350,6 +350,6 @@ def test_different_claims_that_share_their_first_number():
         np.array([[0, 1, -1]]), ((1, np.array([0, 1, 2])), (1, np.array([2, 2, 2]))), np.arange(3), np.eye(3), []
     )
     signatures = np.array([[7, 1], [7, 2], [0, 0]], dtype=np.uint64)
-    order, starts = enumeration._different(enumeration._keys(view, slice(None), signatures))
+    order, starts = enumeration.different(enumeration._keys(view, slice(None), signatures))
     assert len(starts) == 3
     assert sorted(order.tolist()) == [0, 1, 2]
