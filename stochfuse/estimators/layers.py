@@ -16,14 +16,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import chain
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 
-from stochfuse.estimators.ledger import different
-
-if TYPE_CHECKING:
-    from stochfuse.estimators.local_fusion_graph import GraphState, LocalFusionGraph
+from stochfuse.estimators.ledger import Ledger, different
+from stochfuse.estimators.protocol import FusionRule
 
 MOST_NODES, MOST_STATES = 48, 1 << 14
 """Nodes of a state, and states, that are told by one word together."""
@@ -35,6 +33,35 @@ _LAST = np.iinfo(np.int64).max
 _RANDOM = np.random.default_rng(7).integers(1 << 64, size=(2, 4, 64), dtype=np.uint64) | np.uint64(1)
 
 
+class Agent(NamedTuple):
+    """An agent before an exchange: value of its local estimate and the pedigree it rests on, as a mask of nodes."""
+
+    value: int
+    known: int
+
+
+class GraphState(NamedTuple):
+    """What is known before an exchange.
+
+    Parameters
+    ----------
+    nodes : value and pedigree (itself included) of every older node that can still matter, ancestors first.
+    agents : one per agent.
+    late : (receiver, steps until it arrives, pedigree) of messages under way.
+    """
+
+    nodes: tuple[tuple[int, int], ...]
+    agents: tuple[Agent, ...]
+    late: tuple[tuple[int, int, int], ...] = ()
+
+
+class NaiveState(NamedTuple):
+    """Before an exchange: the agents' local estimates, and (receiver, steps left, estimate) of messages under way."""
+
+    agents: tuple[int, ...]
+    late: tuple[tuple[int, int, int], ...] = ()
+
+
 class GraphLayer:
     """Some states' exchanges, nothing under way.
 
@@ -44,7 +71,7 @@ class GraphLayer:
     states : at most `MOST_STATES`, of at most `MOST_NODES` nodes with those of the agents; see `fits`.
     """
 
-    def __init__(self, estimator: LocalFusionGraph, states: Sequence[GraphState]) -> None:
+    def __init__(self, estimator: FusionRule, states: Sequence[GraphState]) -> None:
         self.estimator, self.states, self.agents = estimator, states, len(estimator.sources)
         numbers = np.array([len(state.nodes) for state in states])
         self.first = int(numbers.max())
@@ -58,7 +85,7 @@ class GraphLayer:
         self.below[:, self.first :] = agents[..., 1] | 1 << self.first + np.arange(self.agents)
 
     @staticmethod
-    def fits(estimator: LocalFusionGraph, states: Sequence[GraphState]) -> bool:
+    def fits(estimator: FusionRule, states: Sequence[GraphState]) -> bool:
         """Whether the states can stand in arrays."""
         agents, step = len(estimator.sources), estimator.ledger.step[states[0].agents[0].value]
         most = max(len(state.nodes) for state in states) + agents
@@ -84,12 +111,10 @@ class GraphLayer:
         sets, index = np.unique(heard, return_inverse=True)
         index = index.reshape(heard.shape)
         masks, unions = self._masks(sets.tolist()), self.unions(sets.tolist())
-        sources = self.estimator.sources
-        local = {source: self.estimator.ledger.locals(unions, source) for source in set(sources)}
-        values = np.stack([local[source][:, index[:, i]] for i, source in enumerate(sources)], axis=-1)
+        values = _locals(self.estimator, unions, index)
         of = np.repeat(np.arange(len(self.states)), len(heard))
         known = masks[:, index].reshape(-1, self.agents)
-        which, states = _Merging(self, of, known, values.reshape(-1, self.agents)).merged()
+        which, states = _Merging(self, of, known, values).merged()
         return which.reshape(len(self.states), -1), states
 
     def _masks(self, heard: Sequence[int]) -> np.ndarray:
@@ -174,14 +199,8 @@ class _Merging:
         who[~self.kept[item]] = _LAST
         at = self._sequence(item, who)[:, : self.most]
         rows = self._rows(item, order, at)
-        keys = _hashes(rows)
-        # of several orders that serve as well one that all items of a kind agree upon
-        first = np.lexsort((keys[0], item))
-        first = first[np.flatnonzero(np.diff(item[first], prepend=-1))]
-        by_key, starts = different(keys[:, first])
-        which = np.empty(len(first), dtype=np.int64)
-        which[by_key] = np.repeat(np.arange(len(starts)), np.diff([*starts, len(by_key)]))
-        return which, _states([part[first[by_key[starts]]] for part in rows])
+        which, first = _one_of_each(item, rows)
+        return which, _states([part[first] for part in rows])
 
     def _sequence(self, item: np.ndarray, who: np.ndarray) -> np.ndarray:
         """Nodes in the order of their keys, equal ones by the keys of their ancestors and descendants."""
@@ -205,30 +224,98 @@ class _Merging:
         """Relabellings that put the agents of each item into their least order, (items, relabellings)."""
         tokens = mixed(self.rank + self.holders.sum(axis=-1), 3)
         theirs = (self.holders.astype(np.uint64) * tokens[:, :, None]).sum(axis=1)
-        keys = mixed(theirs + mixed(_mapped(self.values, self.ledger.invariant), 2), 1)
-        least = np.ones((len(keys), len(self.permutations)), dtype=bool)
-        for agent in self.permutations.T:
-            theirs = keys[:, agent]
-            least &= theirs == np.where(least, theirs, np.uint64(_LAST) << np.uint64(1)).min(axis=1)[:, None]
-        return least
+        return _least(mixed(theirs + mixed(_mapped(self.values, self.ledger.invariant), 2), 1), self.permutations)
 
     def _rows(self, item: np.ndarray, order: np.ndarray, at: np.ndarray) -> list[np.ndarray]:
         """Values and pedigrees of nodes, −1 and 0 beyond the last, and of agents, renamed."""
         taken, real = self.permutations[order], np.take_along_axis(self.kept[item], at, axis=1)
         nodes = np.where(real, np.take_along_axis(self.nodes[item], at, axis=1), -1)
         agents = np.take_along_axis(self.values[item], taken, axis=1)
-        for number in np.unique(order).tolist():
-            here, permutation = np.flatnonzero(order == number), tuple(self.permutations[number].tolist())
-            for part in (nodes, agents):
-                part[here] = _mapped(part[here], lambda value: self.ledger.moved(value, permutation))  # noqa: B023
+        nodes, agents = (_moved(self.ledger, part, order, self.permutations) for part in (nodes, agents))
         below = np.where(real, np.take_along_axis(self.below[item], at, axis=1), 0)
         known = np.take_along_axis(self.known[item], taken, axis=1)
         return [nodes, _renumbered(below, at), agents, _renumbered(known, at)]
 
 
-def _states(rows: Sequence[np.ndarray]) -> list[GraphState]:
-    from stochfuse.estimators.local_fusion_graph import Agent, GraphState
+class NaiveLayer:
+    """Some states' exchanges in naive fusion, nothing under way; see `GraphLayer`."""
 
+    def __init__(self, estimator: FusionRule, states: Sequence[NaiveState]) -> None:
+        self.estimator = estimator
+        self.values = np.array([state.agents for state in states])
+
+    def unions(self, heard: Sequence[int]) -> np.ndarray:
+        """Values of the sums of some sets of agents, (states, sets)."""
+        states, out = np.arange(len(self.values)), []
+        for h in heard:
+            members = [i for i in range(self.values.shape[1]) if h >> i & 1]
+            terms, of = self.values[:, members].ravel(), np.repeat(states, len(members))
+            ones = np.ones(len(terms), dtype=np.int64)
+            out.append(self.estimator.ledger.combined(self.values[:, 0], of, terms, ones) if members[1:] else terms)
+        return np.stack(out, axis=1)
+
+    def commons(self, clauses: Sequence[Sequence[int]]) -> np.ndarray:
+        """Nothing is taken for common."""
+        return np.full((len(self.values), len(clauses)), -1)
+
+    def after(self, heard: np.ndarray) -> tuple[np.ndarray, list[NaiveState]]:
+        """States before the next exchange, and which one follows on each state and outcome; see `GraphLayer`."""
+        ledger, permutations = self.estimator.ledger, np.array(self.estimator.relabellings)
+        sets, index = np.unique(heard, return_inverse=True)
+        values = _locals(self.estimator, self.unions(sets.tolist()), index.reshape(heard.shape))
+        item, order = np.nonzero(_least(mixed(_mapped(values, ledger.invariant), 1), permutations))
+        agents = np.take_along_axis(values[item], permutations[order], axis=1)
+        agents = _moved(ledger, agents, order, permutations)
+        which, first = _one_of_each(item, [agents])
+        return which.reshape(len(self.values), -1), [NaiveState(tuple(row)) for row in agents[first].tolist()]
+
+
+def _locals(estimator: FusionRule, unions: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """Values of the agents' next local estimates, (states · outcomes, agents).
+
+    Parameters
+    ----------
+    unions : (states, sets) what is fused.
+    index : (outcomes, agents) number of the set that each agent hears.
+    """
+    local = {source: estimator.ledger.locals(unions, source) for source in set(estimator.sources)}
+    values = [local[source][:, index[:, i]] for i, source in enumerate(estimator.sources)]
+    return np.stack(values, axis=-1).reshape(-1, len(values))
+
+
+def _least(keys: np.ndarray, permutations: np.ndarray) -> np.ndarray:
+    """Which permutations put rows of keys into their least order, (rows, permutations)."""
+    least = np.ones((len(keys), len(permutations)), dtype=bool)
+    for agent in permutations.T:
+        theirs = keys[:, agent]
+        least &= theirs == np.where(least, theirs, np.iinfo(np.uint64).max).min(axis=1)[:, None]
+    return least
+
+
+def _moved(ledger: Ledger, values: np.ndarray, order: np.ndarray, permutations: np.ndarray) -> np.ndarray:
+    """Values (rows, any number) after the agents changed places, by each row's permutation."""
+    out = np.empty_like(values)
+    for number in np.unique(order).tolist():
+        here, permutation = np.flatnonzero(order == number), tuple(permutations[number].tolist())
+        out[here] = _mapped(values[here], lambda value: ledger.moved(value, permutation))  # noqa: B023
+    return out
+
+
+def _one_of_each(item: np.ndarray, rows: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Number of every item's row among the different ones, and where one of each of these is.
+
+    Of several rows of an item, which are next to each other, one that all items of a kind agree upon.
+    """
+    keys = _hashes(rows)
+    first = np.lexsort((keys[0], item))
+    first = first[np.flatnonzero(np.diff(item[first], prepend=-1))]
+    order, starts = different(keys[:, first])
+    which = np.empty(len(first), dtype=np.int64)
+    which[order] = np.repeat(np.arange(len(starts)), np.diff([*starts, len(order)]))
+    return which, first[order[starts]]
+
+
+def _states(rows: Sequence[np.ndarray]) -> list[GraphState]:
     numbers = (rows[0] >= 0).sum(axis=1).tolist()
     nodes, below, agents, known = (part.tolist() for part in rows)
     return [

@@ -413,13 +413,14 @@ class InformationClaims:
 
 def _summed(numbers: np.ndarray, terms: Sequence[tuple[int, np.ndarray]]) -> np.ndarray:
     """Σ sign · numbers[values] over (sign, values of any one shape); the value −1 stands for nothing."""
-    (_, first), *others = terms
-    total = numbers.take(first, axis=0)
-    total[first < 0] = 0.0
-    for sign, values in others:
-        here = np.nonzero(values >= 0)
-        total[here] += sign * numbers.take(values[here], axis=0)
-    return total
+    from scipy.sparse import csr_array
+
+    which = np.stack([values.ravel() for _, values in terms], axis=1)
+    signs = np.where(which < 0, 0.0, [sign for sign, _ in terms])
+    ends = np.arange(0, which.size + 1, len(terms))
+    places = (signs.ravel(), np.maximum(which, 0).ravel(), ends)
+    matrix = csr_array(places, shape=(len(which), len(numbers)))
+    return (matrix @ numbers.reshape(len(numbers), -1)).reshape(*terms[0][1].shape, *numbers.shape[1:])
 
 
 def estimated(information: Information, step: int) -> tuple[Estimate, np.ndarray]:

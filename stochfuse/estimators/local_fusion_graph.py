@@ -26,34 +26,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from stochfuse.errors import TooManyError
-from stochfuse.estimators.layers import GraphLayer
+from stochfuse.estimators.layers import Agent, GraphLayer, GraphState
 from stochfuse.estimators.ledger import COMMON, Ledger
 from stochfuse.estimators.protocol import AdditiveLayer, FusionRule, Late, best_relabelling
-
-
-class Agent(NamedTuple):
-    """An agent before an exchange: value of its local estimate and the pedigree it rests on, as a mask of nodes."""
-
-    value: int
-    known: int
-
-
-class GraphState(NamedTuple):
-    """What is known before an exchange.
-
-    Parameters
-    ----------
-    nodes : value and pedigree (itself included) of every older node that can still matter, ancestors first.
-    agents : one per agent.
-    late : (receiver, steps until it arrives, pedigree) of messages under way.
-    """
-
-    nodes: tuple[tuple[int, int], ...]
-    agents: tuple[Agent, ...]
-    late: tuple[tuple[int, int, int], ...] = ()
 
 
 class Pedigrees:

@@ -173,7 +173,7 @@ def test_blocks_and_repeated_noises_change_nothing(monkeypatch, errors):
     monkeypatch.setattr(general, "CHUNK", 500)
     monkeypatch.setattr(optimal, "BLOCK", 200)
     monkeypatch.setattr(enumeration, "LISTED", 50)
-    monkeypatch.setattr(enumeration, "MOST_WEIGHTS", 200)
+    monkeypatch.setattr(general, "HELD", 1000)
     monkeypatch.setattr(general, "HELD", 100)
     general._kept.cache_clear()
     for run, found in zip(runs, whole, strict=True):
