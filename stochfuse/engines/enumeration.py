@@ -43,7 +43,7 @@ MOST_CELLS = 1 << 21
 """Outcomes of one exchange up to which they are listed."""
 LONG = 1000
 """States from which on the work is long enough to be announced before."""
-TOGETHER = 1 << 12
+TOGETHER = 1 << 14
 """States whose last two exchanges are gone through at a time."""
 AT_A_TIME = 1 << 17
 """Outcomes of states, in every order of the agents, that are merged at a time."""

@@ -393,7 +393,9 @@ class InformationClaims:
 
     def __init__(self, information: Information) -> None:
         d = information.Y.shape[-1]
-        self.information, y = information, information.y
+        # beside each other they would be copied whenever some are added up
+        y, Y = (None if part is None else np.ascontiguousarray(part) for part in information)
+        self.information = Information(y, Y)
         items = information.Y[0].size // d**2
         self.width = items * d * max(d, 0 if y is None else y.shape[-1])
 
