@@ -24,6 +24,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
+from functools import cached_property
 from itertools import combinations
 from typing import Any, NamedTuple, cast
 
@@ -32,6 +33,7 @@ import numpy as np
 from stochfuse.engines.events import ChanceEvent, Outcome, Rows, Weights, concerning, number_of_outcomes, outcomes
 from stochfuse.engines.progress import listener, uncollected
 from stochfuse.errors import TooManyError
+from stochfuse.estimators.ledger import different
 from stochfuse.estimators.protocol import AdditiveEstimator, Estimator
 from stochfuse.scenario.system import Detection
 
@@ -41,10 +43,12 @@ MOST_CELLS = 1 << 21
 """Outcomes of one exchange up to which they are listed."""
 LONG = 1000
 """States from which on the work is long enough to be announced before."""
-LISTED = 1 << 20
-"""Weights of outcomes that are gone through at a time while equal claims are found."""
-MOST_WEIGHTS = 1 << 24
-"""Weights of claims that are held at a time."""
+TOGETHER = 1 << 14
+"""States whose last two exchanges are gone through at a time."""
+AT_A_TIME = 1 << 17
+"""Outcomes of states, in every order of the agents, that are merged at a time."""
+LISTED = 1 << 21
+"""Outcomes, or weights of some, that are gone through at a time while equal claims are found."""
 MOST_ENDINGS = 1_000_000
 """Outcomes of the last exchange, over all states, up to which they are listed one by one."""
 WRITTEN_OUT = 10**30
@@ -204,19 +208,44 @@ def _next_layer(
     request: Request,
 ) -> dict[Any, Any]:
     times, found = request.weights.times, {}
-    total, progress = len(layer), listener()
-    for done, (state, weight) in enumerate(layer.items()):
-        exchange = state if request.plain else estimator.exchange(state)
-        for outcome in possible:
-            if request.plain:
-                after = exchange.onward(outcome.heard, outcome.late, outcome.missed)
-            else:
-                after, _ = exchange.after(outcome.heard, outcome.late, outcome.missed)
-            new = times(weight, outcome.factor)
-            known = found.get(after)
-            found[after] = new if known is None else known + new
-        progress.advance(f"step {step}", done + 1, total)
+    total, progress, done = len(layer), listener(), 0
+    for states, weights, exchanges in _in_parts(estimator, layer, possible, request):
+        if exchanges is None:
+            for state, weight in zip(states, weights, strict=True):
+                exchange = state if request.plain else estimator.exchange(state)
+                for outcome in possible:
+                    if request.plain:
+                        after = exchange.onward(outcome.heard, outcome.late, outcome.missed)
+                    else:
+                        after, _ = exchange.after(outcome.heard, outcome.late, outcome.missed)
+                    new = times(weight, outcome.factor)
+                    known = found.get(after)
+                    found[after] = new if known is None else known + new
+                done += 1
+                progress.advance(f"step {step}", done, total)
+            continue
+        which, after = exchanges.after(np.array([outcome.heard for outcome in possible]))
+        for weight, numbers in zip(weights, which.tolist(), strict=True):
+            for outcome, number in zip(possible, numbers, strict=True):
+                new = times(weight, outcome.factor)
+                known = found.get(after[number])
+                found[after[number]] = new if known is None else known + new
+        done += len(states)
+        progress.advance(f"step {step}", done, total)
     return found
+
+
+def _in_parts(
+    estimator: Estimator, layer: dict[Any, Any], possible: list[Outcome], request: Request
+) -> Iterator[tuple[list[Any], list[Any], Any]]:
+    """States with weights, and their exchanges many at a time, None where they are gone through one by one."""
+    states, weights = list(layer), list(layer.values())
+    plain = request.plain or not estimator.additive or any(outcome.late or outcome.missed for outcome in possible)
+    size = max(1, AT_A_TIME // (len(possible) * len(estimator.relabellings)))
+    for first in range(0, len(states), size):
+        some = states[first : first + size]
+        together = None if plain else cast(AdditiveEstimator, estimator).together(some)
+        yield some, weights[first : first + size], together
 
 
 def _likeliest(layer: dict[Any, np.ndarray], request: Request) -> dict[Any, np.ndarray]:
@@ -315,7 +344,7 @@ def _two_step_ending(
 ) -> Ending:
     """The last two exchanges for every state, through the lattice of what can be common."""
     weights, n = request.weights, request.agents
-    table = _Table(estimator, n)
+    table = _LastViews(estimator, n)
     views = []
     sets = _last_heard(last, request)
     most = max(len(concerning(before, _members(fused, n))) for fused in sets)
@@ -336,11 +365,16 @@ def _two_step_ending(
             sign = 1 if size % 2 else -1
             terms += [(sign, table.common([heard[i] for i in T])) for T in combinations(members, size)]
         views.append((terms, starts, factors, shares))
-    ids, progress = [], listener()
-    for done, state in enumerate(layer, start=1):
-        ids.append(table.values(estimator.exchange(state)))
-        progress.advance(f"steps {step - 1} and {step}", done, len(layer))
-    ids = np.array(ids)
+    ids, progress, states = [], listener(), list(layer)
+    for first in range(0, len(states), TOGETHER):
+        some = states[first : first + TOGETHER]
+        exchanges = estimator.together(some)
+        if exchanges is not None:
+            ids.append(table.values_of(exchanges))
+        else:
+            ids.append(np.array([table.values(estimator.exchange(state)) for state in some]))
+        progress.advance(f"steps {step - 1} and {step}", first + len(some), len(states))
+    ids = np.concatenate(ids)
     made = [FusedSet(ids, tuple((s, i) for s, i in terms if i is not None), *rest) for terms, *rest in views]
     return Ending(step, weights.table(list(layer.values()), degree), made, events)
 
@@ -385,7 +419,7 @@ def _cells(
     return heard, successes, np.eye(len(drawn) + 1)
 
 
-class _Table:
+class _LastViews:
     """Numbers the local estimates and the common pedigrees that the views of a step need."""
 
     def __init__(self, estimator: AdditiveEstimator, agents: int) -> None:
@@ -428,18 +462,91 @@ class _Table:
         brought = [-1 if value is None else ledger.forward(value, step) for value in commons]
         return [*locals_, *reversed(brought), -1]
 
+    def values_of(self, exchanges: Any) -> np.ndarray:
+        """Values of many states, (states, values), as `values` has those of one."""
+        ledger, pairs = self.estimator.ledger, list(self._locals)
+        heard = sorted({h for _, h in pairs})
+        unions = exchanges.unions(heard)
+        fused = dict(zip(heard, unions.T, strict=True))
+        locals_ = [ledger.locals(fused[h], source) for source, h in pairs]
+        commons = ledger.forwards(exchanges.commons(self._clauses), int(ledger.steps[locals_[0][0]]))
+        return np.stack([*locals_, *commons.T[::-1], np.full(len(unions), -1)], axis=1)
 
-class Claimed(NamedTuple):
+
+@dataclass(frozen=True, eq=False)
+class Claimed:
     """Different claims of a step, outcomes with equal ones added up: Y = Σ sign · Y[ids].
 
     Parameters
     ----------
     terms : (sign, values (claims,)); the value −1 stands for nothing.
-    weights : weight of each claim for every group of agents, (groups, width, claims).
+    which : number of the claim in every outcome, (states, cells).
+    view : the outcomes.
+    states : weight of every state, on the weights' axis.
+    events : events up to the step.
+    bookkeeping : of the weights.
     """
 
     terms: tuple[tuple[int, np.ndarray], ...]
-    weights: np.ndarray
+    which: np.ndarray
+    view: FusedSet
+    states: np.ndarray
+    events: int
+    bookkeeping: Weights
+
+    @property
+    def number(self) -> int:
+        """How many claims there are."""
+        return len(self.terms[0][1])
+
+    @cached_property
+    def width(self) -> int:
+        """Length of the weights' axis before the last exchange counts."""
+        return self.bookkeeping.pairs(self.states[:1], self.view.factors).shape[2]
+
+    @cached_property
+    def total(self) -> np.ndarray:
+        """Weight of each claim before the last exchange counts, (width, claims); see `shared`."""
+        from scipy.sparse import csr_array
+
+        total, factor_of = np.zeros((self.number, self.width)), self._factor_of
+        for some, pairs in self._pairs():
+            which = self.which[some].ravel()
+            pair_of = (np.arange(len(pairs))[:, None] * pairs.shape[1] + factor_of).ravel()
+            places = (np.ones(len(which)), (which, pair_of))
+            total += csr_array(places, shape=(self.number, pairs[:, :, 0].size)) @ pairs.reshape(-1, self.width)
+        return np.ascontiguousarray(total.T)
+
+    def expected(self, values: np.ndarray) -> np.ndarray:
+        """Σ weight · values (claims, numbers) for every group of agents, (groups, full width, numbers).
+
+        Without the weight of any claim: for few numbers of many claims.
+        """
+        found = np.zeros((self.width, values.shape[1]))
+        for some, pairs in self._pairs():
+            by_factor = np.add.reduceat(values[self.which[some]], self.view.starts, axis=1)
+            found += np.tensordot(pairs, by_factor, axes=((0, 1), (0, 1)))
+        return self.shared(found)
+
+    def shared(self, found: np.ndarray) -> np.ndarray:
+        """What is known before the last exchange counts, (width, ...), after it: (groups, full width, ...)."""
+        weights, by_group = self.bookkeeping, []
+        for share in self.view.shares:
+            whole = None if share is None else weights.completed(weights.weighed(found, share), self.events)
+            by_group.append(None if whole is None else weights.collected(whole))
+        shape = next(part for part in by_group if part is not None).shape
+        return np.stack([np.zeros(shape) if part is None else part for part in by_group])
+
+    @property
+    def _factor_of(self) -> np.ndarray:
+        return np.repeat(np.arange(len(self.view.factors)), np.diff([*self.view.starts, self.which.shape[1]]))
+
+    def _pairs(self) -> Iterator[tuple[slice, np.ndarray]]:
+        """Weights of some states with every factor, (states, factors, width), at a time."""
+        size = max(1, LISTED // max(self.which.shape[1], len(self.view.factors) * self.width))
+        for first in range(0, len(self.which), size):
+            some = slice(first, first + size)
+            yield some, self.bookkeeping.pairs(self.states[some], self.view.factors)
 
 
 def claims_of(ending: Ending, signatures: np.ndarray | None, weights: Weights) -> Iterator[Claimed]:
@@ -451,85 +558,26 @@ def claims_of(ending: Ending, signatures: np.ndarray | None, weights: Weights) -
         see `stochfuse.estimators.ledger.Ledger.signatures`; None where nothing is summed.
     """
     for view in ending.views:
-        gathered = _Gathered(view, ending, weights)
         cells = len(view.terms[0][1])
-        factor_of = np.repeat(np.arange(len(view.factors)), np.diff([*view.starts, cells]))
-        width = ending.weights.shape[1] + view.factors.shape[1]
-        size = max(1, LISTED // (cells * width))
+        size = max(1, LISTED // cells)
         for first in range(0, len(view.ids), size):
             states = slice(first, first + size)
-            gathered.add(states, *_keys(view, states, signatures), factor_of)
-            if gathered.full:
-                yield gathered.claimed()
-                gathered = _Gathered(view, ending, weights)
-        if gathered.place:
-            yield gathered.claimed()
+            order, starts = different(_keys(view, states, signatures))
+            which = np.empty(len(order), dtype=np.int32)
+            which[order] = np.repeat(np.arange(len(starts)), np.diff([*starts, len(order)]))
+            row, cell = np.divmod(order[starts], cells)
+            terms = tuple((sign, view.ids[states][row, index[cell]]) for sign, index in view.terms)
+            yield Claimed(terms, which.reshape(-1, cells), view, ending.weights[states], ending.events, weights)
 
 
-def _keys(view: FusedSet, states: slice, signatures: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """One number for what is claimed in each outcome, (states · cells), equal where claims are, and their order."""
+def _keys(view: FusedSet, states: slice, signatures: np.ndarray | None) -> np.ndarray:
+    """Numbers for what is claimed in each outcome, (1 or 2, states · cells), equal where claims are."""
     ids = view.ids[states]
     if len(view.terms) == 1 or signatures is None:
         ((_, index),) = view.terms
-        keys = ids[:, index].ravel()
-        return keys, np.argsort(keys)
-    keys = np.zeros((len(ids), len(view.terms[0][1]), 2), dtype=np.uint64)
+        return ids[:, index].reshape(1, -1)
+    numbers = np.moveaxis(signatures[ids], -1, 0)
+    keys = np.zeros((2, len(ids), len(view.terms[0][1])), dtype=np.uint64)
     for sign, index in view.terms:
-        part = signatures[ids[:, index]]
-        (np.add if sign > 0 else np.subtract)(keys, part, out=keys)
-    keys = keys.reshape(-1, 2)
-    first = np.ascontiguousarray(keys[:, 0])
-    # two different claims share a number once in 10^19 pairs: where the second number differs, both count
-    order = np.argsort(first)
-    one, other = first[order], keys[order, 1]
-    if not ((one[1:] == one[:-1]) & (other[1:] != other[:-1])).any():
-        return first, order
-    both = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
-    return both, np.argsort(both)
-
-
-class _Gathered:
-    """Claims of a view with their weights, while states are gone through."""
-
-    def __init__(self, view: FusedSet, ending: Ending, weights: Weights) -> None:
-        self.view, self.ending, self.weights = view, ending, weights
-        self.place: dict[int, int] = {}
-        self._ids: list[np.ndarray] = []
-        self._total = np.zeros((0, 0))
-
-    @property
-    def full(self) -> bool:
-        """Whether the weights take as much memory as they may."""
-        return len(self.place) * self._total.shape[1] > MOST_WEIGHTS
-
-    def add(self, states: slice, keys: np.ndarray, order: np.ndarray, factor_of: np.ndarray) -> None:
-        """Add up the weights of some states' outcomes, (states · cells), in the order of their keys."""
-        view, sorted_keys = self.view, keys[order]
-        starts = np.flatnonzero(np.concatenate([[True], sorted_keys[1:] != sorted_keys[:-1]]))
-        before = len(self.place)
-        at = np.array([self.place.setdefault(key, len(self.place)) for key in sorted_keys[starts].tolist()])
-        row, cell = np.divmod(order[starts[at >= before]], len(factor_of))
-        self._ids.append(np.stack([view.ids[states][row, index[cell]] for _, index in view.terms], axis=-1))
-        pairs = self.weights.pairs(self.ending.weights[states], view.factors)
-        pair_of = (np.arange(len(keys) // len(factor_of))[:, None] * len(view.factors) + factor_of).ravel()
-        part = np.add.reduceat(pairs.reshape(-1, pairs.shape[-1])[pair_of[order]], starts, axis=0)
-        self._grow(part.shape[1])
-        self._total[at] += part
-
-    def _grow(self, width: int) -> None:
-        if len(self.place) > len(self._total):
-            more = np.zeros((max(len(self.place), 2 * len(self._total)), width))
-            more[: len(self._total), : self._total.shape[1]] = self._total
-            self._total = more
-
-    def claimed(self) -> Claimed:
-        """Return the claims with their weights for every group of agents."""
-        weights, events = self.weights, self.ending.events
-        ids, total = np.concatenate(self._ids), self._total[: len(self.place)].T
-        by_group = []
-        for share in self.view.shares:
-            part = None if share is None else weights.completed(weights.weighed(total, share), events)
-            by_group.append(None if part is None else weights.collected(part))
-        shape = next(part for part in by_group if part is not None).shape
-        stacked = np.stack([np.zeros(shape) if part is None else part for part in by_group])
-        return Claimed(tuple((sign, ids[:, t]) for t, (sign, _) in enumerate(self.view.terms)), stacked)
+        (np.add if sign > 0 else np.subtract)(keys, numbers.take(index, axis=2), out=keys)
+    return keys.reshape(2, -1)

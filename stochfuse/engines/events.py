@@ -274,7 +274,8 @@ class _Polynomial(_Memoryless):
         width = states.shape[1] + factors.shape[1] - 1
         out = np.zeros((len(states), len(factors), width))
         for c, column in enumerate(factors.T):
-            out[:, :, c : c + states.shape[1]] += states[:, None] * column[:, None]
+            for factor in np.flatnonzero(column).tolist():
+                out[:, factor, c : c + states.shape[1]] += column[factor] * states
         return out
 
     def weighed(self, total: np.ndarray, weight: np.ndarray) -> np.ndarray:

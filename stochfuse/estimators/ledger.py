@@ -18,6 +18,7 @@ Values under numbers, when agents of one kind change places: what ledgers of sum
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -99,6 +100,8 @@ class Ledger(Renamed):
         self._value_of: dict[tuple[int, tuple[tuple[int, int], ...]], int] = {}
         self._prior_of: dict[int, int] = {}
         self._local_of: dict[tuple[int, int | None], int] = {}
+        self._random, self._steps = np.random.default_rng(0), np.zeros(0, dtype=np.int64)
+        self._of_atoms, self._signatures = np.zeros((0, 2), dtype=np.uint64), np.zeros((0, 2), dtype=np.uint64)
         super().__init__(kinds, None if kinds is None else Ledger())
 
     def start(self, source: int) -> int:
@@ -144,19 +147,70 @@ class Ledger(Renamed):
                 total[atom] = total.get(atom, 0) + coefficient * times
         return self._value(step, tuple(sorted([pair for pair in total.items() if pair[1]])))
 
+    def combined(self, like: np.ndarray, of: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """Return many sums at a time, see `combine`, each written down once.
+
+        Parameters
+        ----------
+        like : of every sum, a value of its step.
+        of : number of its sum, of every term; in order, none without terms.
+        values, times : of the terms.
+        """
+        step = self.steps[like]
+        brought = self._forwarded(values, step[of])
+        starts = np.searchsorted(of, np.arange(len(like)))
+        signed = times.view(np.uint64)[:, None] * self.signatures()[brought]
+        order, first = different(np.ascontiguousarray(np.add.reduceat(signed, starts, axis=0).T))
+        ends, terms = np.append(starts[1:], len(of)), np.stack([brought, times], axis=1)
+        new = [self.combine(int(step[one]), terms[starts[one] : ends[one]].tolist()) for one in order[first].tolist()]
+        out = np.empty(len(like), dtype=np.int64)
+        out[order] = np.repeat(new, np.diff([*first, len(order)]))
+        return out
+
+    def locals(self, values: np.ndarray, source: int | None) -> np.ndarray:
+        """Return many local estimates at a time, see `local`."""
+        found, which = np.unique(values, return_inverse=True)
+        return np.array([self.local(value, source) for value in found.tolist()])[which].reshape(values.shape)
+
+    def forwards(self, values: np.ndarray, step: int) -> np.ndarray:
+        """Return many values brought forward, see `forward`; −1 stays."""
+        found, which = np.unique(values, return_inverse=True)
+        new = [value if value < 0 else self.forward(value, step) for value in found.tolist()]
+        return np.array(new)[which].reshape(values.shape)
+
+    def _forwarded(self, values: np.ndarray, steps: np.ndarray) -> np.ndarray:
+        out = values.copy()
+        early = self.steps[values] < steps
+        for step in np.unique(steps[early]).tolist():
+            here = np.flatnonzero(early & (steps == step))
+            out[here] = self.forwards(values[here], step)
+        return out
+
+    @property
+    def steps(self) -> np.ndarray:
+        """Step of every value."""
+        if len(self._steps) < len(self.step):
+            self._steps = np.concatenate([self._steps, self.step[len(self._steps) :]])
+        return self._steps
+
     def signatures(self) -> np.ndarray:
         """Two random numbers per value, (values + 1, 2), that add up modulo 2^64 as the sums do; the last: nothing."""
-        random = np.random.default_rng(0).integers(1 << 64, size=(len(self.atoms), 2), dtype=np.uint64)
-        which, times, first = self.table()
-        signed = times.astype(np.int64).view(np.uint64)[:, None] * random[which]
-        total = np.add.reduceat(signed, first, axis=0)
-        return np.concatenate([total, np.zeros((1, 2), dtype=np.uint64)])
+        known = max(0, len(self._signatures) - 1)
+        if known < len(self.sums):
+            more = (len(self.atoms) - len(self._of_atoms), 2)
+            drawn = self._random.integers(1 << 64, size=more, dtype=np.uint64)
+            self._of_atoms = np.concatenate([self._of_atoms, drawn])
+            which, times, first = self.table(range(known, len(self.sums)))
+            signed = times.view(np.uint64)[:, None] * self._of_atoms[which]
+            found = np.add.reduceat(signed, first, axis=0)
+            self._signatures = np.concatenate([self._signatures[:known], found, np.zeros((1, 2), dtype=np.uint64)])
+        return self._signatures
 
-    def table(self, values: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Sums of values (default: all): atoms and coefficients one after the other, and where each sum begins."""
-        sums = self.sums if values is None else [self.sums[value] for value in values]
-        which, times = np.array([pair for sum_ in sums for pair in sum_], dtype=int).reshape(-1, 2).T
-        first = np.cumsum([0] + [len(sum_) for sum_ in sums[:-1]])
+    def table(self, values: Iterable[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Sums of values: atoms and coefficients one after the other, and where each sum begins."""
+        sums = [self.sums[value] for value in values]
+        which, times = np.fromiter(chain.from_iterable(chain.from_iterable(sums)), dtype=np.int64).reshape(-1, 2).T
+        first = np.cumsum([0, *map(len, sums)])[:-1]
         return which, times, first
 
     def _renamed(self, value: int, into: Ledger, names: Sequence[int], known: dict[int, int]) -> int:
@@ -191,6 +245,18 @@ class Ledger(Renamed):
             self.sums.append(atoms)
             self.step.append(step)
         return known
+
+
+def different(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Order of keys, of 1 or 2 numbers (numbers, keys), and where the different ones begin in it."""
+    order = np.argsort(keys[0])
+    first, last = keys[0][order], keys[-1][order]
+    new, other = first[1:] != first[:-1], last[1:] != last[:-1]
+    # two different keys share a number once in 10^19 pairs: where the second number differs, both count
+    if (other & ~new).any():
+        order = np.lexsort(keys[::-1])
+        new = (keys[:, order[1:]] != keys[:, order[:-1]]).any(axis=0)
+    return order, np.flatnonzero(np.concatenate([[True], new]))
 
 
 class Sources:
@@ -327,12 +393,11 @@ class InformationClaims:
 
     def __init__(self, information: Information) -> None:
         d = information.Y.shape[-1]
-        self.information, y = information, information.y
+        # beside each other they would be copied whenever some are added up
+        y, Y = (None if part is None else np.ascontiguousarray(part) for part in information)
+        self.information = Information(y, Y)
         items = information.Y[0].size // d**2
         self.width = items * d * max(d, 0 if y is None else y.shape[-1])
-        # the last entry, −1, stands for nothing
-        self._Y = np.concatenate([information.Y, np.zeros_like(information.Y[:1])])
-        self._y = None if y is None else np.concatenate([y, np.zeros_like(y[:1])])
 
     def estimate(self, terms: Sequence[tuple[int, np.ndarray]], step: int) -> tuple[Estimate, np.ndarray]:
         """Estimates of a step from sums of values, and by how much rounding grew, for each item of a batch.
@@ -342,10 +407,22 @@ class InformationClaims:
         NoAnswerError
             If some sum is no positive-definite information.
         """
-        Y: Any = sum(sign * self._Y[values] for sign, values in terms)
-        y = None if self._y is None else sum(sign * self._y[values] for sign, values in terms)
-        estimate, magnified = estimated(Information(y, Y), step)
+        y, Y = self.information
+        found = Information(None if y is None else _summed(y, terms), _summed(Y, terms))
+        estimate, magnified = estimated(found, step)
         return estimate, magnified.max(axis=(0, -1))
+
+
+def _summed(numbers: np.ndarray, terms: Sequence[tuple[int, np.ndarray]]) -> np.ndarray:
+    """Σ sign · numbers[values] over (sign, values of any one shape); the value −1 stands for nothing."""
+    from scipy.sparse import csr_array
+
+    which = np.stack([values.ravel() for _, values in terms], axis=1)
+    signs = np.where(which < 0, 0.0, [sign for sign, _ in terms])
+    ends = np.arange(0, which.size + 1, len(terms))
+    places = (signs.ravel(), np.maximum(which, 0).ravel(), ends)
+    matrix = csr_array(places, shape=(len(which), len(numbers)))
+    return (matrix @ numbers.reshape(len(numbers), -1)).reshape(*terms[0][1].shape, *numbers.shape[1:])
 
 
 def estimated(information: Information, step: int) -> tuple[Estimate, np.ndarray]:

@@ -26,33 +26,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from stochfuse.errors import TooManyError
+from stochfuse.estimators.layers import GraphLayer, GraphState, HeldEstimate
 from stochfuse.estimators.ledger import COMMON, Ledger
-from stochfuse.estimators.protocol import FusionRule, Late, best_relabelling
-
-
-class HeldEstimate(NamedTuple):
-    """An agent before an exchange: value of its local estimate and the pedigree it rests on, as a mask of nodes."""
-
-    value: int
-    known: int
-
-
-class GraphState(NamedTuple):
-    """What is known before an exchange.
-
-    Parameters
-    ----------
-    nodes : value and pedigree (itself included) of every older node that can still matter, ancestors first.
-    agents : one per agent.
-    late : (receiver, steps until it arrives, pedigree) of messages under way.
-    """
-
-    nodes: tuple[tuple[int, int], ...]
-    agents: tuple[HeldEstimate, ...]
-    late: tuple[tuple[int, int, int], ...] = ()
+from stochfuse.estimators.protocol import AdditiveLayer, FusionRule, Late, best_relabelling
 
 
 class Pedigrees:
@@ -163,6 +142,10 @@ class LocalFusionGraph(FusionRule):
         """Open the exchange of the state's step."""
         values, below = [value for value, _ in state.nodes], [below for _, below in state.nodes]
         return GraphExchange(self, Pedigrees(self.ledger, values, below), state.agents, state.late)
+
+    def together(self, states: Sequence[GraphState]) -> AdditiveLayer | None:
+        """Open the exchanges of many states, where they can stand in arrays."""
+        return GraphLayer(self, states) if GraphLayer.fits(self, states) else None
 
     def rests_on(self, state: GraphState) -> Iterator[int]:
         """Values that a state rests on."""

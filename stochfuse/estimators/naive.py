@@ -9,17 +9,10 @@ covariance falls below what any estimator can reach.  A late message is brought 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
 
+from stochfuse.estimators.layers import NaiveLayer, NaiveState
 from stochfuse.estimators.ledger import COMMON
-from stochfuse.estimators.protocol import FusionRule, Late, in_least_order
-
-
-class NaiveState(NamedTuple):
-    """Before an exchange: the agents' local estimates, and (receiver, steps left, estimate) of messages under way."""
-
-    agents: tuple[int, ...]
-    late: tuple[tuple[int, int, int], ...] = ()
+from stochfuse.estimators.protocol import AdditiveLayer, FusionRule, Late, in_least_order
 
 
 class NaiveFusion(FusionRule):
@@ -34,6 +27,10 @@ class NaiveFusion(FusionRule):
     def exchange(self, state: NaiveState) -> NaiveExchange:
         """Open the exchange of the state's step."""
         return NaiveExchange(self, state)
+
+    def together(self, states: Sequence[NaiveState]) -> AdditiveLayer | None:
+        """Open the exchanges of many states, where nothing is under way."""
+        return None if any(state.late for state in states) else NaiveLayer(self, states)
 
     def rests_on(self, state: NaiveState) -> Iterator[int]:
         """Values that a state rests on."""

@@ -92,6 +92,31 @@ class AdditiveEstimator(Estimator, Protocol):
     sources: tuple[int, ...]
     removes: bool
 
+    def together(self, states: Sequence[Any]) -> AdditiveLayer | None:
+        """Open the exchanges of many states of one step, or None: one by one then."""
+        ...
+
+
+class AdditiveLayer(Protocol):
+    """The exchanges of many states of an additive estimator, with nothing under way."""
+
+    def unions(self, heard: Sequence[int]) -> np.ndarray:
+        """Values of what would be fused from some sets of agents, (states, sets)."""
+        ...
+
+    def commons(self, clauses: Sequence[Sequence[int]]) -> np.ndarray:
+        """Values of what agents that heard some sets have in common, (states, sets of sets); −1 where it is nothing."""
+        ...
+
+    def after(self, heard: np.ndarray) -> tuple[np.ndarray, list[Any]]:
+        """Number of the state before the next exchange, (states, outcomes), and these states.
+
+        Parameters
+        ----------
+        heard : (outcomes, agents) whom each agent hears, as masks.
+        """
+        ...
+
 
 class Claims(Protocol):
     """What the values of an estimator stand for, in numbers.
@@ -179,6 +204,10 @@ class FusionRule:
     def book(self) -> Ledger:
         """Where values are written down."""
         return self.ledger
+
+    def together(self, states: Sequence[Any]) -> AdditiveLayer | None:
+        """Open the exchanges of many states: here, one by one."""
+        return None
 
     def seen(self, missed: int) -> Iterator[int | None]:
         """Source of what each agent measures; None for those, a mask, whose sensor misses."""

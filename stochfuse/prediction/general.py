@@ -117,7 +117,7 @@ class Enumerated:
             held, numbers = [], 0
             for block in found:
                 held.append(block)
-                numbers += block.weights.size
+                numbers += block.which.size // 2 + block.number * block.width
                 if numbers > HELD:
                     return _rest(held, found)
             self._held[step] = held
@@ -128,12 +128,16 @@ class Enumerated:
         rounding grew in them.
         """
         for block in self.claims(step):
-            claims = block.weights.shape[2]
-            size = max(1, CHUNK // values.width)
-            for first in range(0, claims, size):
-                some = slice(first, first + size)
-                estimate, grown = values.estimate([(sign, ids[some]) for sign, ids in block.terms], step)
-                yield block.weights[:, :, some], estimate, grown
+            for some, estimate, grown in in_numbers(block, values, step):
+                yield block.shared(block.total[:, some]), estimate, grown
+
+
+def in_numbers(block: Claimed, values: Claims, step: int) -> Iterator[tuple[slice, Any, Any]]:
+    """Estimates of some claims of a step at a time, and by how much rounding grew in them."""
+    size = max(1, CHUNK // values.width)
+    for first in range(0, block.number, size):
+        some = slice(first, first + size)
+        yield some, *values.estimate([(sign, ids[some]) for sign, ids in block.terms], step)
 
 
 def _rest(held: list[Claimed], found: Iterator[Claimed]) -> Iterator[Claimed]:
@@ -206,7 +210,7 @@ class Outcomes:
     def _expectations(self, values: Claims) -> list[tuple[list[Any], float]]:
         found, steps = [], self.system.steps
         for step in range(1, steps + 1):
-            found.append(_expectation(self.found.shared_out(step, values), self._of))
+            found.append(_expectation(self.found.claims(step), values, step, self._of))
             listener().advance("averaging", step, steps)
         return found
 
@@ -312,7 +316,7 @@ class Outcomes:
     def _kept(self) -> np.ndarray:
         """Probability of the outcomes that were not left out, (rows, steps)."""
         steps = range(1, self.system.steps + 1)
-        by_step = [sum(block.weights[0].sum(axis=-1) for block in self.found.claims(step)) for step in steps]
+        by_step = [sum(b.expected(np.ones((b.number, 1)))[0, :, 0] for b in self.found.claims(step)) for step in steps]
         return np.stack(by_step, axis=1)
 
     def statistic(self, name: str, metric: Metric, groups: Sequence[int], quantity: str = "claimed") -> np.ndarray:
@@ -358,7 +362,7 @@ class Outcomes:
 
     def _blocks_of_rows(self, step: int) -> list[slice]:
         """Rows in blocks small enough that a distribution of each fits in memory."""
-        rows, claims = len(self.links.link), sum(block.weights.shape[2] for block in self.found.claims(step))
+        rows, claims = len(self.links.link), sum(block.number for block in self.found.claims(step))
         size = max(1, MOST_PROBABILITIES // claims)
         return [slice(first, first + size) for first in range(0, rows, size)]
 
@@ -420,7 +424,7 @@ class Outcomes:
 
 
 def _expectation(
-    claims: Iterable[tuple[np.ndarray, Any, Any]], of: Callable[[Estimate], Any]
+    claims: Iterable[Claimed], values: Claims, step: int, of: Callable[[Estimate], Any]
 ) -> tuple[list[Any], float]:
     """Expected state and covariance per group of agents, (48)/(49), on the weights' axis, and growth of rounding.
 
@@ -428,21 +432,37 @@ def _expectation(
     ----------
     of : makes what is averaged, a named tuple of arrays or Nones, of a stack of estimates.
     """
-    magnified, total, kind = 1.0, {}, None
-    groups = 0
-    for weights, estimate, grown in claims:
-        magnified, averaged, groups = max(magnified, float(grown)), of(estimate), len(weights)
-        kind = type(averaged)
-        for place, values in enumerate(averaged):
-            if values is not None:
-                part = np.tensordot(weights, values, axes=1)
-                total[place] = total[place] + part if place in total else part
-    if kind is None:
+    magnified, total, averaged = 1.0, None, None
+    for block in claims:
+        few = []
+        for some, estimate, grown in in_numbers(block, values, step):
+            magnified, averaged = max(magnified, float(grown)), of(estimate)
+            flat = [part.reshape(len(part), -1) for part in averaged if part is not None]
+            numbers = np.concatenate(flat, axis=1)
+            # the cheaper of the two: numbers of every outcome, or weights of every claim
+            if numbers.shape[1] < block.width:
+                few.append(numbers)
+            else:
+                total = _sum(total, block.shared(block.total[:, some] @ numbers))
+        if few:
+            total = _sum(total, block.expected(np.concatenate(few)))
+    if averaged is None or total is None:
         raise StochfuseError("no outcome is possible")
-    by_group = [
-        [total[place][g] if place in total else None for place in range(len(kind._fields))] for g in range(groups)
-    ]
-    return [kind(*found) for found in by_group], magnified
+    return [_unflattened(by_group, averaged) for by_group in total], magnified
+
+
+def _sum(total: np.ndarray | None, part: np.ndarray) -> np.ndarray:
+    return part if total is None else total + part
+
+
+def _unflattened(numbers: np.ndarray, like: Any) -> Any:
+    """Numbers (width, numbers) as arrays (width, ...) of the shapes that a named tuple has for each estimate."""
+    found, first = [], 0
+    for part in like:
+        size = 0 if part is None else part[0].size
+        found.append(None if part is None else numbers[:, first : first + size].reshape(-1, *part.shape[1:]))
+        first += size
+    return type(like)(*found)
 
 
 def check_statistic(name: str, quantity: str, metric: Metric) -> tuple[str, float]:

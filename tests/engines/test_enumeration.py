@@ -9,8 +9,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import stochfuse as sf
+from stochfuse.engines import enumeration
 from stochfuse.engines.progress import Progress, listening
+from stochfuse.estimators.local_fusion_graph import LocalFusionGraph
+from stochfuse.estimators.naive import NaiveFusion
+from stochfuse.estimators.protocol import FusionRule
 from stochfuse.kalman.metrics import metric
+from stochfuse.prediction import general
 from stochfuse.scenario.scenario import link_rows
 from tests.benchmarks import literal
 from tests.oracles import strategies, textbook
@@ -59,11 +64,45 @@ def test_against_the_benchmarks_plain_enumeration():
 
 
 def test_merged_graphs_are_few():
-    """Theory section 5: 15, 389, 11,335 for three agents ad hoc (a few ties are left apart here), 4, 19, 98, 522 broadcast."""
+    """15, 389, 11,335 for three agents ad hoc, 4, 19, 98, 522 broadcast."""
     cases = {"ad-hoc": [1, 15, 389], "broadcast": [1, 4, 19, 98, 522], "cyclic": [1, 4, 24, 176, 1376]}
     for architecture, states in cases.items():
         scenario = sf.load_scenario(architecture=architecture, steps=len(states) + 1)
         assert outcomes(scenario, link_rows(scenario)).structure.states == states
+
+
+@pytest.mark.parametrize("estimator", ["local-fusion-graph", "naive"])
+@pytest.mark.parametrize(
+    ("architecture", "steps", "more"),
+    [
+        ("ad-hoc", 4, {}),
+        ("broadcast", 5, {"initial": {"correlation": "shared"}}),
+        ("cyclic", 5, {}),
+        ("ad-hoc", 3, {"agent": True}),
+    ],
+)
+@pytest.mark.parametrize("errors", [False, True])
+def test_many_states_at_a_time_are_those_one_by_one(monkeypatch, architecture, steps, more, errors, estimator):
+    rng = np.random.default_rng(steps)
+    made = strategies.mapping(*strategies.model(rng, 1, 1), 3, steps, architecture=architecture, link=0.4)
+    made["initial"] |= more.get("initial", {})
+    if "agent" in more:
+        made["agent"] = [{"R": (np.array(made["model"]["R"]) * (1 + (i > 0))).tolist()} for i in range(3)]
+    scenario = sf.Scenario.from_mapping(made)
+    monkeypatch.setattr(enumeration, "TOGETHER", 7)
+    monkeypatch.setattr(enumeration, "AT_A_TIME", 1000)
+    arrays = outcomes(scenario, link_rows(scenario), estimator, errors=errors)
+    general._kept.cache_clear()
+    monkeypatch.setattr(FusionRule, "together", lambda *_: None)
+    for rule in (LocalFusionGraph, NaiveFusion):
+        monkeypatch.delattr(rule, "together")
+    single = outcomes(scenario, link_rows(scenario), estimator, errors=errors)
+    # a few ties are left apart, here or there
+    assert np.all(np.array(arrays.structure.states) <= 1.01 * np.array(single.structure.states))
+    for quantity in ("claimed", "actual") if errors else ("claimed",):
+        expected = single.covariance(quantity=quantity)
+        np.testing.assert_allclose(arrays.covariance(quantity=quantity), expected, rtol=1e-12)
+    general._kept.cache_clear()
 
 
 @pytest.mark.parametrize(("architecture", "agents", "steps"), [("ad-hoc", 4, 2), ("broadcast", 5, 3), ("cyclic", 5, 3)])
