@@ -23,9 +23,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from math import ceil, sqrt
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,18 +38,20 @@ from stochfuse.engines.contact_chain import (
     expected_optimum,
     number_of_paths,
 )
-from stochfuse.engines.contact_sample import sample_optimum
+from stochfuse.engines.contact_sample import OptimumSample, sample_optimum
 from stochfuse.engines.enclosure import enclosed_optimum
+from stochfuse.engines.heard import Heard
 from stochfuse.engines.monte_carlo import size_of_block
+from stochfuse.engines.precision import suspects
 from stochfuse.errors import UsageError
 from stochfuse.kalman.metrics import Moments
 from stochfuse.prediction.method import Settings
 from stochfuse.scenario import capabilities
 from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.registry import CHAIN, NO_CONTROL, OPTIMAL, STAND_ALONE, SUMS
-from stochfuse.scenario.system import System
+from stochfuse.scenario.system import Noises, System
 
-KIND = "exact optimum"
+KIND, HEARD = "exact optimum", "numbers heard"
 WORTH = 1.2
 """Reduction of the variance below which a sample is left as it is."""
 BLOCKS = 25
@@ -66,6 +68,8 @@ COSTS = (30.0, 8.0)
 """What a run of an estimator that removes what is common, or of another one, costs in runs of the optimum, about."""
 FURTHER = (4.0, 40.0)
 """Least and most further runs of the optimum for every run."""
+FEW = 12
+"""Agents of the optimum up to which equal histories, gathered, pay, and its expectation is known anyway."""
 MOST_HELD = 100_000_000
 """Entries of the optimum's covariances that are held."""
 SEPARATE = 1 << 20
@@ -188,7 +192,7 @@ def _indefinite(m: np.ndarray) -> bool:
 
 def no_control(system: System, links: LinkRows, how: Settings) -> str | None:
     """Why there is no control for a sample, in words, empty where nothing needs to be said; None if there is one."""
-    if how.control == NO_CONTROL or how.estimator in (OPTIMAL, STAND_ALONE):
+    if how.control == NO_CONTROL or how.estimator == STAND_ALONE or (how.estimator == OPTIMAL and system.agents <= FEW):
         return ""
     try:
         capabilities.require(system, links, OPTIMAL, CHAIN)
@@ -200,21 +204,59 @@ def no_control(system: System, links: LinkRows, how: Settings) -> str | None:
     return None
 
 
-def optimum_of(system: System, links: LinkRows, how: Settings, blocks: list[tuple[int, int]]) -> Moments:
-    """Return the optimum's moments in the runs of a sample, (rows, runs, steps, agents, …).
+class Followed:
+    """What goes with the runs of a sample that may grow: the optimum, or of that itself what stands in for it.
 
     Parameters
     ----------
-    blocks : number of runs, and first block of random numbers, of every part of the sample.
+    how : seed, workers and estimator.
     """
-    parts = [sample_optimum(system, links, runs, how.seed, workers=how.workers, first=first) for runs, first in blocks]
-    P = np.concatenate([part.P for part in parts], axis=1)
-    return _moments(P, np.concatenate([b for part in parts if (b := part.bias) is not None] or [P[:0]], axis=1))
 
+    def __init__(self, system: System, links: LinkRows, how: Settings) -> None:
+        self._asked, self._waiting = (system, links, how), []
+        self._found: list[np.ndarray | None] = []
+        self._parts = 0
+        self.kind = HEARD if how.estimator == OPTIMAL else KIND
 
-def _moments(P: np.ndarray, bias: np.ndarray) -> Moments:
-    """The optimum achieves what it claims; without a known error nothing is known of a bias."""
-    return Moments(P, P, bias, P + bias @ np.swapaxes(bias, -1, -2)) if len(bias) else Moments(P, P, None, P)
+    @cached_property
+    def expected(self) -> Expected | None:
+        """What is expected of it; None where that is not cheap."""
+        system, links, _ = self._asked
+        if self.kind == KIND:
+            return expectation(system, links)
+        if self.heard is None:
+            return None
+        return Expected(self.heard.expected(), np.zeros((len(links.link), system.steps)))
+
+    @cached_property
+    def heard(self) -> Heard | None:
+        """What stands in for the optimum; None where rounding may matter."""
+        system, links, _ = self._asked
+        return None if suspects(system, Noises(P0=system.P0[None])).any() else Heard(system, links)
+
+    def drawn(self, runs: int, first: int) -> OptimumSample:
+        """Draw the optimum of a further part of the sample: number of runs, and first block of random numbers."""
+        system, links, how = self._asked
+        found = sample_optimum(system, links, runs, how.seed, workers=how.workers, first=first)
+        if self.kind == HEARD:
+            self._waiting.append(found.heard)
+        return found
+
+    def in_runs(self, parts: Sequence[tuple[int, int]]) -> Moments:
+        """Moments in the runs of a sample of such parts, (rows, runs, steps, agents, …), each followed once."""
+        for runs, first in parts[self._parts :]:
+            if self.kind == KIND:
+                found = self.drawn(runs, first)
+                more = found.P, found.bias
+            else:
+                if self.heard is None:
+                    raise ValueError("nothing stands in for the optimum")
+                more = self.heard.of(self._waiting.pop(0))
+            before = self._found or [None if m is None else m[:, :0] for m in more]
+            pairs = zip(before, more, strict=True)
+            self._found = [None if m is None or n is None else np.concatenate([m, n], axis=1) for m, n in pairs]
+            self._parts += 1
+        return Moments.of_optimum(*self._found)
 
 
 def expectation(system: System, links: LinkRows) -> Expected | None:
@@ -267,7 +309,6 @@ def estimated(system: System, links: LinkRows, how: Settings, correlation: float
     return Expected(means.map(lambda m: m.mean(axis=1)), bound, means, blocks * size / how.runs)
 
 
-def _mean(drawn: Any) -> Moments:
+def _mean(drawn: OptimumSample) -> Moments:
     """Mean moments of the optimum in some runs, (rows, steps, agents, …)."""
-    moments = _moments(drawn.P, drawn.P[:0] if drawn.bias is None else drawn.bias)
-    return moments.map(lambda m: m.mean(axis=1))
+    return Moments.of_optimum(drawn.P, drawn.bias).map(lambda m: m.mean(axis=1))

@@ -18,13 +18,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.engines.contact_sample import sample_optimum
-from stochfuse.engines.events import concerning, events, relabellings
+from stochfuse.engines.events import events, relabellings
 from stochfuse.engines.monte_carlo import Experiment, Sample, sample, size_of_block
 from stochfuse.errors import UsageError
 from stochfuse.estimators.making import kinds_of, make, make_together
@@ -33,16 +32,16 @@ from stochfuse.estimators.world import claimed_only, moments
 from stochfuse.kalman.metrics import Metric, Moments
 from stochfuse.kalman.metrics import metric as metric_of
 from stochfuse.prediction.control import (
+    FEW,
     KIND,
     MOST_HELD,
     WORTH,
     Control,
     Expected,
+    Followed,
     coefficients,
     estimated,
-    expectation,
     no_control,
-    optimum_of,
 )
 from stochfuse.prediction.general import groups_alike, spread
 from stochfuse.prediction.method import Averaged, Settings, Shown, group_of, joined, seconds, share
@@ -54,8 +53,8 @@ from stochfuse.scenario.system import Items, Noises, System
 
 MOST_NUMBERS = 500_000_000
 """Claimed values that a sample may hold."""
-FEW, MOST_ENTRIES = 12, 200_000_000
-"""Agents of the optimum up to which equal histories, gathered, pay; entries of its covariances in a sample."""
+MOST_ENTRIES = 200_000_000
+"""Entries of the optimum's covariances in a sample."""
 FEW_TOGETHER = 6
 """Agents up to which equal histories, gathered, pay more than following many runs at a time."""
 MANY = 10_000
@@ -255,16 +254,16 @@ def sampled(
     permutations = relabellings(network, links, kinds)
     groups = groups_alike(network, links, kinds, permutations)
     odds = _odds(system, links, groups, how.estimator)
-    known = cache(lambda: expectation(system, links))  # the same at every stage of a sample that grows
+    optimum = Followed(system, links, how)
 
     def draw(before: Sample | None, runs: int, first: int) -> Sample:
         now = replace(how, runs=runs)
         if how.estimator == OPTIMAL and network.agents > FEW:
-            return _extended(before, _optimum(system, links, now, first, errors))
+            return _extended(before, _optimum(optimum, system, len(links.link), now, first, errors))
         return _extended(before, _drawn(system, links, now, permutations, first=first, errors=errors))
 
     def judge(drawn: Sample, parts: Parts) -> tuple[tuple[Sampled, str, Reduced], float]:
-        found = helped(system, links, how, Sampled(drawn, groups, odds), parts, shown, known)
+        found = helped(system, links, how, Sampled(drawn, groups, odds), parts, shown, optimum)
         values, error = found[0].shown(system, shown)
         there = error > 0
         with np.errstate(divide="ignore"):  # no error but 0 is a share of 0
@@ -306,14 +305,17 @@ def helped(
     plain: Sampled,
     parts: Parts,
     shown: Shown,
-    known: Callable[[], Expected | None],
+    optimum: Followed,
 ) -> tuple[Sampled, str, Reduced]:
-    """Correct a sample by the optimum, of `known` expectation, where that helps; also what to say of it."""
+    """Correct a sample by the optimum, or what stands in for it, where that helps; also what to say of it."""
     how = replace(how, runs=plain.runs)
     why = no_control(system, links, how)
     if why is not None or not plain.odds.any():
         return plain, f"control: none; {why}" if why else "", Reduced()
-    runs, expected = optimum_of(system, links, how, parts), known()
+    expected = optimum.expected
+    if expected is None and how.estimator == OPTIMAL:
+        return plain, "", Reduced()
+    runs = optimum.in_runs(parts)
     # of an unknown expectation as if it were the sample's mean, to see whether further runs are worth their time
     own = Expected(runs.map(lambda m: m.mean(axis=1)), np.zeros(plain.odds.shape[:2]))
     found = replace(plain, control=Control(runs, expected or own))
@@ -325,12 +327,12 @@ def helped(
     if reduction == 0.0:  # nothing is uncertain
         return plain, "", Reduced()
     if reduction < WORTH or expected is None:
-        why = f"the exact optimum takes away too little of the variance (1/{reduction:.2f})"
+        why = f"the {optimum.kind} take{'s' if optimum.kind == KIND else ''} away too little of the variance (1/{reduction:.2f})"
         return plain, f"control: none; {why}", Reduced()
     mean = "exact" if expected.further is None else "estimated"
     by = "" if mean == "exact" else f"; its mean from {expected.runs:.3g} times as many runs of its own"
     told = f"1/{float(f'{reduction:.3g}'):,g}" if reduction < 1e6 else "less than a millionth"
-    return found, f"control: {KIND}; variance {told}{by}", Reduced(KIND, min(reduction, MOST_REDUCED), mean)
+    return found, f"control: {optimum.kind}; variance {told}{by}", Reduced(optimum.kind, min(reduction, MOST_REDUCED), mean)
 
 
 def _reduction(plain: Sampled, found: Sampled, system: System, shown: Shown) -> float:
@@ -344,13 +346,17 @@ def _reduction(plain: Sampled, found: Sampled, system: System, shown: Shown) -> 
 def _odds(system: System, links: LinkRows, groups: Sequence[Sequence[int]], estimator: str) -> np.ndarray:
     """Probability that not just the likeliest becomes of what may reach groups at a step, (rows, steps, groups)."""
     likeliest = np.ones((len(links.link), system.steps, len(groups)))
+    group, of_links = group_of(groups), np.ones((len(links.link), len(groups)))
     for step in range(1, system.steps + 1):
-        drawn = [] if estimator == STAND_ALONE else events(system.network, links, step)
-        for g, group in enumerate(groups):
-            for event in concerning(drawn, group):
-                likeliest[:, step - 1, g] *= np.maximum(1.0 - event.probability, event.probability * max(event.delay))
-            for agent, p in system.detections(step):
-                likeliest[:, step - 1, g] *= max(p, 1.0 - p) if agent in group else 1.0
+        if step == 1 or links.varies:
+            of_links = np.ones((len(links.link), len(groups)))
+            for event in [] if estimator == STAND_ALONE else events(system.network, links, step):
+                likely = np.maximum(1.0 - event.probability, event.probability * max(event.delay))
+                for g in {int(group[i]) for i in event.receivers}:
+                    of_links[:, g] *= likely
+        likeliest[:, step - 1] = of_links
+        for agent, p in system.detections(step):
+            likeliest[:, step - 1, group[agent]] *= max(p, 1.0 - p)
     return np.where(likeliest < 1.0, 1.0 - likeliest, 0.0)
 
 
@@ -400,12 +406,13 @@ def states(system: System, links: LinkRows, how: Settings, records: np.ndarray) 
     permutations = relabellings(system.network, links, range(system.agents))
     drawn = _drawn(system, links, how, permutations, records=records)
     x = drawn.values.x[..., 0][drawn.which]
-    expected = None if no_control(system, links, how) is not None else expectation(system, links)
+    optimum = Followed(system, links, how)
+    expected = None if no_control(system, links, how) is not None else optimum.expected
     if expected is None:
         return x, x
     # variances say of an estimate only how it hangs together with them: there is no usual coefficient
     of, mean = (
-        np.diagonal(P, axis1=-2, axis2=-1) for P in (optimum_of(system, links, how, [(how.runs, 0)]).P, expected.mean.P)
+        np.diagonal(P, axis1=-2, axis2=-1) for P in (optimum.in_runs([(how.runs, 0)]).P, expected.mean.P)
     )
     off = of - mean[:, None]
     return x, np.stack([x[r] - coefficients(x[r], off[r], 0.0) * off[r] for r in range(len(x))])
@@ -461,16 +468,16 @@ def _drawn(
     return sample(experiment, rows, workers=workers)
 
 
-def _optimum(system: System, links: LinkRows, how: Settings, first: int, errors: bool) -> Sample:
+def _optimum(optimum: Followed, system: System, rows: int, how: Settings, first: int, errors: bool) -> Sample:
     """Sample the optimum by Boolean products: nearly every history of many agents has a value of its own."""
-    n, d, steps, rows = system.agents, system.dimension, system.steps, len(links.link)
+    n, d, steps = system.agents, system.dimension, system.steps
     entries = how.runs * rows * steps * n * d**2
     if entries > MOST_ENTRIES:
         raise UsageError(
             f"runs: {how.runs} runs for {rows} link probabilities, {steps} steps and {n} agents of {d} states are "
             f"{entries:.3g} entries of covariances; expected at most {MOST_ENTRIES:.3g}"
         )
-    found = sample_optimum(system, links, how.runs, how.seed, workers=how.workers, first=first)
+    found = optimum.drawn(how.runs, first)
     P = found.P.reshape(-1, d, d)
     values = Moments(P)
     if errors:
