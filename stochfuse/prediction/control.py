@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from math import ceil, sqrt
 from typing import NamedTuple
 
@@ -58,6 +58,8 @@ BLOCKS = 25
 """Blocks of runs; β of one is from all the others."""
 UNLIKELY = 5.0
 """Standard errors of the optimum's mean from its expectation that tell of outcomes that were not met."""
+UNMET = 0.004
+"""What the numbers heard leave of an outcome too rare to be met, about, relative to the value; so rare: 1/runs."""
 FLAT = 1e-12
 """Least eigenvalue of a covariance, scaled to unit variances, that is rounding."""
 MOST_NUMBERS, MOST_STATES, MOST_SETS = 20_000_000, 600, 8
@@ -163,9 +165,8 @@ def coefficients(y: np.ndarray, x: np.ndarray, usual: float = 1.0) -> np.ndarray
     unless x̄ lies beyond five of its standard errors from 0: where outcomes that matter are too rare to have been met,
     β tends to what is usual.
     """
-    runs = len(x)
-    starts = np.arange(min(BLOCKS, runs)) * runs // min(BLOCKS, runs)
-    left = (runs - np.diff(starts, append=runs)).reshape(-1, *(1,) * (x.ndim - 1))
+    starts, left, block_of = _blocks(len(x))
+    left = left.reshape(-1, *(1,) * (x.ndim - 1))
 
     def sums(m: np.ndarray) -> np.ndarray:
         """Σ of all blocks but each."""
@@ -178,7 +179,14 @@ def coefficients(y: np.ndarray, x: np.ndarray, usual: float = 1.0) -> np.ndarray
     far = np.maximum(sums(x) ** 2 / left - (UNLIKELY**2 / left) * variance, 0.0)
     total = variance + far
     β = np.divide(common + usual * far, total, out=np.full_like(total, usual), where=total > 0)
-    return β[np.searchsorted(starts, np.arange(runs), side="right") - 1]
+    return β[block_of]
+
+
+@lru_cache(maxsize=8)
+def _blocks(runs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """First run of every block, how many runs are left without it, and the block of every run."""
+    starts = np.arange(min(BLOCKS, runs)) * runs // min(BLOCKS, runs)
+    return starts, runs - np.diff(starts, append=runs), np.searchsorted(starts, np.arange(runs), side="right") - 1
 
 
 def _indefinite(m: np.ndarray) -> bool:
@@ -227,6 +235,14 @@ class Followed:
         if self.heard is None:
             return None
         return Expected(self.heard.expected(), np.zeros((len(links.link), system.steps)))
+
+    def expected_beside(self, runs: int) -> Expected | None:
+        """What is expected of it, and how far a mean of so many runs may be off by what they did not meet."""
+        found = self.expected
+        if found is None or self.kind == KIND:
+            return found
+        first = np.arange(found.bound.shape[1]) == 0  # where it is the optimum
+        return found._replace(bound=found.bound + np.where(first, 0.0, UNMET / runs))
 
     @cached_property
     def heard(self) -> Heard | None:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -83,6 +83,7 @@ class Sampled:
     groups: tuple[tuple[int, ...], ...]
     odds: np.ndarray
     control: Control | None = None
+    _judged: dict[Any, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def runs(self) -> int:
@@ -118,6 +119,12 @@ class Sampled:
 
     def judged(self, metric: Metric, groups: Sequence[int], quantity: str) -> tuple[np.ndarray, np.ndarray]:
         """A quantity of the mean over the agents of some groups, and its standard error, each (rows, steps)."""
+        asked = metric.name, tuple(groups), quantity
+        if asked not in self._judged:
+            self._judged[asked] = self._judge(metric, groups, quantity)
+        return self._judged[asked]
+
+    def _judge(self, metric: Metric, groups: Sequence[int], quantity: str) -> tuple[np.ndarray, np.ndarray]:
         values, index = needed(quantity, self.sample.values), self.sample.which
         of = partial(value, quantity, metric)
         shown, out = np.empty((2, index.shape[0], index.shape[2]))
@@ -312,7 +319,7 @@ def helped(
     why = no_control(system, links, how)
     if why is not None or not plain.odds.any():
         return plain, f"control: none; {why}" if why else "", Reduced()
-    expected = optimum.expected
+    expected = optimum.expected_beside(plain.runs)
     if expected is None and how.estimator == OPTIMAL:
         return plain, "", Reduced()
     runs = optimum.in_runs(parts)
