@@ -119,7 +119,9 @@ def sample_optimum(
     work = _Work(outcomes, _Riccati(system), system, size)
     if workers is None:
         workers = len(os.sched_getaffinity(0)) if rows * runs * sum(map(len, outcomes.events)) >= MANY else 1
-    for done, (row, start, now, left, number) in enumerate(_all_followed(work, blocks, min(workers, len(blocks))), start=1):
+    for done, (row, start, now, left, number) in enumerate(
+        _all_followed(work, blocks, min(workers, len(blocks))), start=1
+    ):
         P[row, start : start + len(now)] = now
         if bias is not None:
             bias[row, start : start + len(now)] = left

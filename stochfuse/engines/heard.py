@@ -136,7 +136,9 @@ class Heard:
     def _gathered(self, longest: int) -> Iterator[_Alike]:
         """Agents by how far is looked back, as far as there are few enough numbers."""
         n, most = self.system.agents, MOST_POINTS // self.system.dimension**2
-        ends = _each(self.distribution, lambda f: np.stack([(f.cumsum(axis=-1) <= c).sum(axis=-1) for c in (CUT, 1 - CUT)]))
+        ends = _each(
+            self.distribution, lambda f: np.stack([(f.cumsum(axis=-1) <= c).sum(axis=-1) for c in (CUT, 1 - CUT)])
+        )
         low, high = np.stack(ends, axis=1)  # (steps, rows, agents)
         width = np.minimum(n + 1, (high - low).max(axis=(0, 1)) // 4 * 4 + 4)
         windows = np.ones(n, dtype=int)
@@ -229,7 +231,9 @@ def _probabilities(system: System, links: LinkRows) -> list[np.ndarray]:
             found.append(found[-1])
             continue
         p = np.zeros((rows, n, n))
-        np.put_along_axis(p, np.broadcast_to(senders, (rows, *senders.shape[1:])), links.matrices(network, step), axis=-1)
+        np.put_along_axis(
+            p, np.broadcast_to(senders, (rows, *senders.shape[1:])), links.matrices(network, step), axis=-1
+        )
         p *= at_once
         p[:, range(n), range(n)] = 1.0
         if detects is not None:

@@ -191,7 +191,7 @@ def _exactly(scenario: Scenario, link: Any, how: Settings, quantity: str) -> Pre
         if how.estimator == OPTIMAL:
             found = predict(scenario, link, OPTIMAL, quantity, runs=2, workers=1)  # two tell that it would be a sample
         else:
-            graphs = int(more * min(EASY, EASILY / 2.0 ** exchange_of(scenario, link)))
+            graphs = int(more * min(EASY, EASILY * 2.0 ** -exchange_of(scenario, link)))
             if not graphs:
                 return None
             kept = {"estimator": how.estimator, "criterion": how.criterion, "max_graphs": graphs}

@@ -46,15 +46,17 @@ from stochfuse.prediction.control import (
 from stochfuse.prediction.general import groups_alike, spread
 from stochfuse.prediction.method import Averaged, Settings, Shown, group_of, joined, seconds, share
 from stochfuse.prediction.quantities import needed, value
-from stochfuse.prediction.stopping import Parts, sampled_to
+from stochfuse.prediction.stopping import FEWEST, FIRST, Parts, sampled_to
 from stochfuse.scenario.network import LinkRows
-from stochfuse.scenario.registry import NO_CONTROL, OPTIMAL, STAND_ALONE
+from stochfuse.scenario.registry import LFG, NO_CONTROL, OPTIMAL, STAND_ALONE
 from stochfuse.scenario.system import Items, Noises, System
 
 MOST_NUMBERS = 500_000_000
 """Claimed values that a sample may hold."""
 MOST_ENTRIES = 200_000_000
 """Entries of the optimum's covariances in a sample."""
+AGENTS_FIRST = 2000
+"""Runs times agents of a first stage where runs are dear: of the Local Fusion Graph."""
 FEW_TOGETHER = 6
 """Agents up to which equal histories, gathered, pay more than following many runs at a time."""
 MANY = 10_000
@@ -281,9 +283,11 @@ def sampled(
         return found, tuple(filter(None, (said, *rare(system, links, found)))), {"control": control._asdict()}
     numbers = len(links.link) * system.steps * system.agents
     most = min(MOST_NUMBERS // numbers, MOST_HELD // numbers // system.dimension**2)
+    dear = system.agents > FEW_TOGETHER and how.estimator == LFG
+    first = max(FEWEST, min(FIRST, AGENTS_FIRST // system.agents)) if dear else FIRST
     limit = None if how.at_most is None else seconds(how.at_most)
     block = size_of_block(system.agents)
-    (found, said, control), reached = sampled_to(share(how.precision), limit, most, block, draw, judge)
+    (found, said, control), reached = sampled_to(share(how.precision), limit, (first, most), block, draw, judge)
     meta = {"control": control._asdict(), "precision": reached.for_programs}
     told = f"precision {100 * reached.reached:.2g} % of each value after {found.runs:,} runs"
     told += f", {100 * reached.asked:.3g} % asked for: {reached.stopped}" if reached.stopped else ""
@@ -339,7 +343,11 @@ def helped(
     mean = "exact" if expected.further is None else "estimated"
     by = "" if mean == "exact" else f"; its mean from {expected.runs:.3g} times as many runs of its own"
     told = f"1/{float(f'{reduction:.3g}'):,g}" if reduction < 1e6 else "less than a millionth"
-    return found, f"control: {optimum.kind}; variance {told}{by}", Reduced(optimum.kind, min(reduction, MOST_REDUCED), mean)
+    return (
+        found,
+        f"control: {optimum.kind}; variance {told}{by}",
+        Reduced(optimum.kind, min(reduction, MOST_REDUCED), mean),
+    )
 
 
 def _reduction(plain: Sampled, found: Sampled, system: System, shown: Shown) -> float:
@@ -418,9 +426,7 @@ def states(system: System, links: LinkRows, how: Settings, records: np.ndarray) 
     if expected is None:
         return x, x
     # variances say of an estimate only how it hangs together with them: there is no usual coefficient
-    of, mean = (
-        np.diagonal(P, axis1=-2, axis2=-1) for P in (optimum.in_runs([(how.runs, 0)]).P, expected.mean.P)
-    )
+    of, mean = (np.diagonal(P, axis1=-2, axis2=-1) for P in (optimum.in_runs([(how.runs, 0)]).P, expected.mean.P))
     off = of - mean[:, None]
     return x, np.stack([x[r] - coefficients(x[r], off[r], 0.0) * off[r] for r in range(len(x))])
 
