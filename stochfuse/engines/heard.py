@@ -11,9 +11,9 @@ to three steps alone: what is held of their data is taken for
     N_k = m_k        N_t = m_t + (n − m_t)(1 − q_i^h)        h = Σ_{t<s≤k} (m_s − 1)
 
 (everybody heard since brings the same share of the others; q_i is such that the expected numbers give what is expected
-to be held after two exchanges), each measurement for the mean one of those the agent may hear, and what was known before
-them for what a fixed number of agents would have made known.  None of this needs to be true: whatever it is, it is the
-same function of the numbers in every run and in the expectation, which is a finite sum over their distributions.
+to be held after two exchanges), each measurement for the mean one of those the agent may hear, and what was known
+before for what a fixed number of agents would have made known.  None of this needs to be true: whatever it is, it is
+the same function of the numbers in every run and in the expectation, a finite sum over their distributions.
 Numbers beyond what hardly ever comes about are cut off, in the runs as in the sum.
 
 The stand-in is the control variate of the optimum in `stochfuse.prediction.control`.
@@ -182,7 +182,7 @@ class Heard:
     def _filtered(
         self, m: Sequence[np.ndarray], since: int, agents: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Filter of some agents along the numbers of the last steps, each of (rows, agents, …) or what goes with that."""
+        """Filter of some agents along the numbers of the last steps, (rows, agents, …) each."""
         last = since + len(m) - 1
         rest = (1,) * max(each.ndim - 2 for each in m) if m[0].ndim > 1 else (1,)
         shape = np.broadcast_shapes((*self.miss[:, last, agents].shape, *rest), *(each.shape for each in m))

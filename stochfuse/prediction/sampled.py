@@ -4,7 +4,8 @@ Standard errors are those of the mean over independent runs.  Agents that are al
 their errors are dependent, the runs are not.  For a metric that is not linear in the covariance the error is carried
 through by the metric's derivative at the mean (delta method), taken by central differences.
 
-Wherever it helps, the exact optimum is the sample's control variate (`stochfuse.prediction.control`).  How many runs a
+Wherever it helps, the exact optimum is the sample's control variate (`stochfuse.prediction.control`), and of the
+optimum of many agents itself a filter of the numbers heard.  How many runs a
 precision takes is found in `stochfuse.prediction.stopping`.
 
 Runs that all met one value say nothing of what they did not meet.  Where they are too few to have met more than the
@@ -338,7 +339,8 @@ def helped(
     if reduction == 0.0:  # nothing is uncertain
         return plain, "", Reduced()
     if reduction < WORTH or expected is None:
-        why = f"the {optimum.kind} take{'s' if optimum.kind == KIND else ''} away too little of the variance (1/{reduction:.2f})"
+        takes = "takes" if optimum.kind == KIND else "take"
+        why = f"the {optimum.kind} {takes} away too little of the variance (1/{reduction:.2f})"
         return plain, f"control: none; {why}", Reduced()
     mean = "exact" if expected.further is None else "estimated"
     by = "" if mean == "exact" else f"; its mean from {expected.runs:.3g} times as many runs of its own"
@@ -358,7 +360,7 @@ def _reduction(plain: Sampled, found: Sampled, system: System, shown: Shown) -> 
     return 0.0 if before == 0 else float(before / max(after, before / MOST_REDUCED))
 
 
-def _odds(system: System, links: LinkRows, groups: Sequence[Sequence[int]], estimator: str) -> np.ndarray:
+def _odds(system: System, links: LinkRows, groups: Sequence[tuple[int, ...]], estimator: str) -> np.ndarray:
     """Probability that not just the likeliest becomes of what may reach groups at a step, (rows, steps, groups)."""
     likeliest = np.ones((len(links.link), system.steps, len(groups)))
     group, of_links = group_of(groups), np.ones((len(links.link), len(groups)))
