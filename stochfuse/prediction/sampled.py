@@ -56,8 +56,8 @@ MOST_NUMBERS = 500_000_000
 """Claimed values that a sample may hold."""
 MOST_ENTRIES = 200_000_000
 """Entries of the optimum's covariances in a sample."""
-AGENTS_FIRST = 2000
-"""Runs times agents of a first stage where runs are dear: of the Local Fusion Graph."""
+DEAR = 40_000
+"""Runs times links of a first stage where runs are dear: of the Local Fusion Graph."""
 FEW_TOGETHER = 6
 """Agents up to which equal histories, gathered, pay more than following many runs at a time."""
 MANY = 10_000
@@ -285,7 +285,7 @@ def sampled(
     numbers = len(links.link) * system.steps * system.agents
     most = min(MOST_NUMBERS // numbers, MOST_HELD // numbers // system.dimension**2)
     dear = system.agents > FEW_TOGETHER and how.estimator == LFG
-    first = max(FEWEST, min(FIRST, AGENTS_FIRST // system.agents)) if dear else FIRST
+    first = max(FEWEST, min(FIRST, DEAR // system.agents**2)) if dear else FIRST
     limit = None if how.at_most is None else seconds(how.at_most)
     block = size_of_block(system.agents)
     (found, said, control), reached = sampled_to(share(how.precision), limit, (first, most), block, draw, judge)
@@ -477,7 +477,8 @@ def _drawn(
     )
     workers = how.workers
     if workers is None:
-        outcomes = how.runs * rows * (1 if experiment.together is None else network.agents)
+        links_of_a_run = network.agents ** (2 if how.estimator == LFG else 1)
+        outcomes = how.runs * rows * (1 if experiment.together is None else links_of_a_run)
         many = outcomes >= MANY and getattr(how.estimator, "travels", True)
         workers = len(os.sched_getaffinity(0)) if many else 1
     return sample(experiment, rows, workers=workers)

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 from stochfuse.engines.monte_carlo import BLOCK
 from stochfuse.engines.progress import within
 
-FIRST, FEWEST = 400, 20
+FIRST, FEWEST = 400, 24
 """Most and fewest runs of the first stage."""
 GROWTH = 40
 """How many times as many runs a stage makes of those before."""
