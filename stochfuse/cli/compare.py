@@ -99,7 +99,7 @@ def compare(
     is sampled, with its standard error.
     """
     from stochfuse.kalman.metrics import metric as metric_of
-    from stochfuse.prediction.method import Shown
+    from stochfuse.prediction.method import ShownPart
 
     to.check(scenario)
     page.check(to.output, to.plot, scenario)
@@ -134,8 +134,8 @@ def compare(
     quantities = quantity_names(quantity or ("claimed,actual,consistency" if several else "claimed"))
     chosen, chosen_agent = metric_of(metric or given.metric or "trace", given.model), whose(agent, given)
     steps = steps_at(at, given)
-    settings["shown"] = Shown(tuple(quantities), (chosen,), chosen_agent, steps)
-    shown = _Shown(chosen, chosen_agent, steps, to, page)
+    settings["shown"] = ShownPart(tuple(quantities), (chosen,), chosen_agent, steps)
+    shown = _Display(chosen, chosen_agent, steps, to, page)
     if several:
         only = None if names == [ALL] else names
         _estimators(shown, given, links, only, None if methods is None else ways[0], quantities, all_steps, settings)
@@ -149,7 +149,7 @@ def _names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",")]
 
 
-class _Shown(NamedTuple):
+class _Display(NamedTuple):
     """How an answer is shown."""
 
     metric: Metric
@@ -165,7 +165,7 @@ class _Shown(NamedTuple):
 
 
 def _methods(
-    how: _Shown,
+    how: _Display,
     scenario: Scenario,
     links: list[float] | None,
     methods: Sequence[str],
@@ -189,7 +189,7 @@ def _methods(
 
 
 def _estimators(
-    how: _Shown,
+    how: _Display,
     scenario: Scenario,
     links: list[float] | None,
     names: Sequence[str] | None,

@@ -340,10 +340,10 @@ class Reported(NamedTuple):
         """Write the page, where it is asked for; with the words of the command line and what was said beside it."""
         if self.report is None:
             return
-        from stochfuse.report.document import Told, document
+        from stochfuse.report.document import DocumentNote, document
         from stochfuse.report.table import write_text
 
-        write_text(document(report, Told(WORDS.get(), scenario, tuple(said))), self.report)
+        write_text(document(report, DocumentNote(WORDS.get(), scenario, tuple(said))), self.report)
 
 
 WORDS: ContextVar[tuple[str, ...]] = ContextVar("WORDS", default=())

@@ -86,7 +86,7 @@ def predict(
     Without a scenario: the thesis' transient one. Options override it.
     """
     from stochfuse.kalman.metrics import metric as metric_of
-    from stochfuse.prediction.method import Shown
+    from stochfuse.prediction.method import ShownPart
     from stochfuse.prediction.predict import predict_several as run
     from stochfuse.prediction.quantities import check
     from stochfuse.report.predictions import PredictionView, report
@@ -139,7 +139,7 @@ def predict(
     asked_for = {"steady": steady, "over": swept} | ({} if interval is None else {"interval": interval})
     # a steady state may have to be sampled
     settings = {**asked_for, **settings_for([way, *[MONTE_CARLO] * steady], **given_settings)}
-    settings["shown"] = Shown(metrics=(chosen,), agent=chosen_agent, steps=steps)
+    settings["shown"] = ShownPart(metrics=(chosen,), agent=chosen_agent, steps=steps)
     if swept and statistic != "mean":
         settings["one_by_one"] = True  # whose outcomes are kept
     if normalise and swept and any(key.name == PLACES["link"] for key in swept.keys):

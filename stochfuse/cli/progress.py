@@ -22,7 +22,7 @@ LINES = (2.0, 10.0, 30.0)
 """Seconds after which a line is written where there is no terminal; from then on every minute."""
 
 
-class Shown(Progress):
+class ProgressThread(Progress):
     """A thread that shows what the work last said."""
 
     def __init__(self) -> None:
@@ -79,13 +79,13 @@ def _terminal() -> bool:
     return sys.stderr is not None and sys.stderr.isatty()
 
 
-_now: list[Shown] = []
+_now: list[ProgressThread] = []
 
 
 @contextmanager
 def shown() -> Iterator[None]:
     """Show the progress of the work inside, and leave the terminal as it was whatever happens."""
-    _now.append(Shown())
+    _now.append(ProgressThread())
     try:
         with listening(_now[-1]):
             yield

@@ -42,7 +42,7 @@ NOT_CRITICAL = ("target", "agents-needed", "sensitivity", "gain", "steady", "ove
 """Questions about a number, which has a step and a metric; whether it is bounded is the same in all of them."""
 
 
-class Asked(NamedTuple):
+class SolveRequest(NamedTuple):
     """Which question."""
 
     target: Annotated[
@@ -92,7 +92,7 @@ class Asked(NamedTuple):
 
 def solve(
     scenario: ScenarioArgument = "thesis-transient",
-    asked_for: Asked = Asked(),
+    asked_for: SolveRequest = SolveRequest(),
     step: Annotated[int | None, option("Step asked about; default: the last.", QUESTION, metavar="K")] = None,
     case: Annotated[
         str | None, option("--sensitivity: which of the scenario's cases.", QUESTION + RARE, metavar="NAME")

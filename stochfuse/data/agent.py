@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.data.knowledge import Knowledge, Latest, Setting, knowledge_of
+from stochfuse.data.knowledge import AgentSetting, Knowledge, Latest, knowledge_of
 from stochfuse.data.messages import Kind, Life, MessageProtocol, Node, decode, encode
 from stochfuse.errors import MessageError, UsageError
 from stochfuse.estimators.making import make_for_data
@@ -139,7 +139,7 @@ class Agent:
         definite = (entry.sums or entry.weighs) and name != registry.OPTIMAL
         kind = Kind(name, sizes, matrices, definite, n * 2 * (protocol.horizon + 1))
         shared = system.shared and start.step == 1 and start.P is None
-        self._setting = Setting(world, agent, riding, kind, protocol, shared)
+        self._setting = AgentSetting(world, agent, riding, kind, protocol, shared)
         late = capabilities.reason(name, registry.GENERAL, "delay") is None
         self._knows: Knowledge = knowledge_of(self._setting, Life(agent, 0), start.step, made, late)
         varies = system.model.varies or any(sensor.varies for sensor in system.sensors)

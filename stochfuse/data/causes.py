@@ -89,7 +89,7 @@ class Cause(NamedTuple):
     of: tuple[str, ...]
 
 
-class _Tried(NamedTuple):
+class _ClosestMistake(NamedTuple):
     """A mistake, the way to make it that comes closest, and how close.
 
     Parameters
@@ -208,7 +208,7 @@ class _Diagnosis:
     def causes(self) -> tuple[Cause, ...]:
         """All of it."""
         until, runs = monotonic() + PATIENCE, _by_agents(ROUGHLY, self.prediction)
-        rough = _Trial(self, runs)
+        rough = _SimulatorTrials(self, runs)
         nothing = self.results.judge(self.results.expected).distance
         tried = self._singles(rough, until)
         best = [*self._closer(tried, until), *self._others(rough)]
@@ -221,7 +221,7 @@ class _Diagnosis:
         explaining = sum(map(self._explains, ranked))
         return tuple(map(self._cause, ranked[: max(LISTED, explaining)]))
 
-    def _others(self, trial: _Trial) -> list[_Tried]:
+    def _others(self, trial: _SimulatorTrials) -> list[_ClosestMistake]:
         found = (self._wrong_link(trial), self._dependent(trial), self._approximate(trial))
         return [t for t in found if t is not None]
 
@@ -232,7 +232,7 @@ class _Diagnosis:
         estimator = LFG if p.estimator == BROADCAST_PRIOR else p.estimator
         return Simulator(self.system, self.rows, estimator, followed=self.results.errors)
 
-    def _singles(self, trial: _Trial, until: float) -> list[_Tried]:
+    def _singles(self, trial: _SimulatorTrials, until: float) -> list[_ClosestMistake]:
         found = []
         for number, mistake in enumerate(MISTAKES):
             if monotonic() > until:
@@ -242,7 +242,9 @@ class _Diagnosis:
             found += [] if best is None else [best]
         return sorted(found, key=self._rank)
 
-    def _pairs(self, trial: _Trial, singles: Sequence[_Tried], until: float) -> list[_Tried]:
+    def _pairs(
+        self, trial: _SimulatorTrials, singles: Sequence[_ClosestMistake], until: float
+    ) -> list[_ClosestMistake]:
         chosen = sorted(singles, key=lambda t: t.fit.off)[:PAIRED]
         pairs, found = list(combinations(chosen, 2)), []
         for number, (one, other) in enumerate(pairs):
@@ -254,10 +256,10 @@ class _Diagnosis:
             found += [] if best is None else [best]
         return sorted(found, key=self._rank)
 
-    def _closer(self, tried: Sequence[_Tried], until: float) -> list[_Tried]:
+    def _closer(self, tried: Sequence[_ClosestMistake], until: float) -> list[_ClosestMistake]:
         """The same, of larger samples where that may decide."""
         near = [t for t in tried if t.fit.p > WORTH][:NEAREST]
-        trial, out = _Trial(self, min(CLOSELY, 2 * max(self.results.runs, ROUGHLY[0])), exactly=True), []
+        trial, out = _SimulatorTrials(self, min(CLOSELY, 2 * max(self.results.runs, ROUGHLY[0])), exactly=True), []
         for t in tried:
             variants = [t.variant] if t in near and t.variant is not None and monotonic() < until else []
             # a search that has found something begins anew around it
@@ -266,16 +268,16 @@ class _Diagnosis:
             out.append(again or t)
         return out
 
-    def _explains(self, t: _Tried) -> bool:
+    def _explains(self, t: _ClosestMistake) -> bool:
         return t.fit.p > self.alpha and not t.refuted
 
-    def _rank(self, t: _Tried) -> tuple[float, ...]:
+    def _rank(self, t: _ClosestMistake) -> tuple[float, ...]:
         price = log(max(2, self.results.runs)) * (t.numbers + len(t.mistakes) - 1)
         if self._explains(t):
             return (0.0, round(t.fit.distance + t.apart + price, 6))
         return (1.0, t.fit.off + price / max(1, t.fit.freedom))
 
-    def _cause(self, t: _Tried) -> Cause:
+    def _cause(self, t: _ClosestMistake) -> Cause:
         names = tuple(m.name for m in t.mistakes)
         seen = t.at if t.variant is None else t.variant.shown(t.at)
         what = " and ".join(m.text.format(t.shown or seen) for m in t.mistakes)
@@ -299,7 +301,7 @@ class _Diagnosis:
             of=names,
         )
 
-    def _wrong_link(self, trial: _Trial) -> _Tried | None:
+    def _wrong_link(self, trial: _SimulatorTrials) -> _ClosestMistake | None:
         """µ of every row as it would fit best."""
         curve = _curve(self.prediction, self.rows, self.results.blocks)
         if curve is None:
@@ -329,13 +331,13 @@ class _Diagnosis:
         rows = uniform_rows([µ for µ, _ in found])
         means = trial.means(replace(self.base, rows=rows))
         apart = 0.0 if means is None else self.results.apart(means)
-        return _Tried((mistake,), None, fit, found[0][0], len(found), apart, False, shown)
+        return _ClosestMistake((mistake,), None, fit, found[0][0], len(found), apart, False, shown)
 
     def _alone(self, b: int, mean: np.ndarray, nothing: np.ndarray) -> float:
         alone = Fits(self.results.blocks[b : b + 1])
         return alone.judge(Means([mean], [nothing], [nothing])).distance
 
-    def _dependent(self, trial: _Trial) -> _Tried | None:
+    def _dependent(self, trial: _SimulatorTrials) -> _ClosestMistake | None:
         """The right results, of fewer runs than there seem to be."""
         means = trial.means(self.base)
         if means is None:
@@ -359,16 +361,18 @@ class _Diagnosis:
         )
         text = "the runs are not independent of each other, and tell no more than about {0} that are"
         shown = f"{min(effective):.3g}"
-        return _Tried((Mistake(DEPENDENT, text, lambda _: iter(())),), None, fit, min(effective), 1, 0.0, False, shown)
+        return _ClosestMistake(
+            (Mistake(DEPENDENT, text, lambda _: iter(())),), None, fit, min(effective), 1, 0.0, False, shown
+        )
 
-    def _approximate(self, trial: _Trial) -> _Tried | None:
+    def _approximate(self, trial: _SimulatorTrials) -> _ClosestMistake | None:
         if self.prediction.nature not in ("approximate", "bound"):
             return None
         text = "nothing is wrong with the simulator: the prediction is approximate, and exact numbers are as the file's"
         return trial.best((Mistake(APPROXIMATE, text, lambda _: iter(())),), [Variant(lambda _: self.base)])
 
 
-class _Trial:
+class _SimulatorTrials:
     """Tries simulators with samples of one size, and exactly where that is asked for and can be had."""
 
     def __init__(self, diagnosis: _Diagnosis, runs: int, *, exactly: bool = False) -> None:
@@ -415,12 +419,14 @@ class _Trial:
             return None
         return found if found is None or all(np.isfinite(m).all() for m in found) else None
 
-    def best(self, mistakes: tuple[Mistake, ...], variants: Iterator[Variant] | Sequence[Variant]) -> _Tried | None:
+    def best(
+        self, mistakes: tuple[Mistake, ...], variants: Iterator[Variant] | Sequence[Variant]
+    ) -> _ClosestMistake | None:
         """The variant that comes closest to the results."""
         found = [t for v in variants if (t := self._fitted(mistakes, v)) is not None]
         return min(found, key=self.diagnosis._rank) if found else None
 
-    def _fitted(self, mistakes: tuple[Mistake, ...], variant: Variant) -> _Tried | None:
+    def _fitted(self, mistakes: tuple[Mistake, ...], variant: Variant) -> _ClosestMistake | None:
         if not variant.grid:
             means = self.means(variant.of(0.0))
             return None if means is None else self._tried(mistakes, variant, means)
@@ -467,14 +473,14 @@ class _Trial:
         inside = [low, high, *(x.real for x in roots if abs(x.imag) < 1e-9 and low < x.real < high)]
         return float(b + min(inside, key=lambda u: np.polyval(quartic, u)))
 
-    def _tried(self, mistakes: tuple[Mistake, ...], variant: Variant, means: Means, at: float = 0.0) -> _Tried:
+    def _tried(self, mistakes: tuple[Mistake, ...], variant: Variant, means: Means, at: float = 0.0) -> _ClosestMistake:
         d, numbers = self.diagnosis, int(bool(variant.grid))
         fit = d.results.judge(means, numbers)
         apart = d.results.apart(means) if fit.p > WORTH else 0.0
-        return _Tried(mistakes, variant, fit, at, numbers, apart)
+        return _ClosestMistake(mistakes, variant, fit, at, numbers, apart)
 
 
-def _together(one: _Tried, other: _Tried) -> Iterator[Variant]:
+def _together(one: _ClosestMistake, other: _ClosestMistake) -> Iterator[Variant]:
     """Ways to make two mistakes at once; of two unknown numbers none."""
     first, (mistake,) = one.variant, other.mistakes
     if first is None or other.variant is None or (first.grid and other.variant.grid):

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import stdtr
 
-from stochfuse.data.expected import Expectations, Expected, Family
+from stochfuse.data.expected import ColumnExpectation, Expectations, Family
 from stochfuse.data.results import ResultsError, SimulatorResults, dense
 from stochfuse.prediction.result import Prediction
 
@@ -101,7 +101,7 @@ class Judged(NamedTuple):
         return abs(own / self.cell.error - 1.0)
 
 
-class _Gathered(NamedTuple):
+class _LinkValues(NamedTuple):
     """A link's values, brought together once.
 
     Parameters
@@ -120,7 +120,7 @@ class _Gathered(NamedTuple):
 
 def _gathered(
     results: SimulatorResults, here: Any, who: np.ndarray | None, prediction: Prediction, families: Sequence[Family]
-) -> _Gathered:
+) -> _LinkValues:
     """Values of some rows, those of one link."""
     groups, steps, agents = prediction.by_group.shape[2], len(prediction.steps), len(prediction.group_of)
     cell, seen = results.step[here] - 1, np.zeros((groups * steps, agents), dtype=bool)
@@ -146,7 +146,7 @@ def _gathered(
             spread = np.sqrt(np.bincount(c, values**2, groups * steps) / (each - 1))
         single.append(spread.reshape(groups, steps))
         number.append(each.reshape(groups, steps))
-    return _Gathered(averages, single, number, seen.reshape(groups, steps, agents))
+    return _LinkValues(averages, single, number, seen.reshape(groups, steps, agents))
 
 
 def _within(cell: np.ndarray, run: np.ndarray) -> np.ndarray:
@@ -272,7 +272,7 @@ def _skewness(values: np.ndarray) -> float:
     return float((deviation**3).mean()) / variance**1.5 / sqrt(len(values)) if variance > 0 else 0.0
 
 
-def _judged(cell: Cell, family: Family, expected: Expected, share: float) -> Judged:
+def _judged(cell: Cell, family: Family, expected: ColumnExpectation, share: float) -> Judged:
     """Complete a cell that comes with the sample's standard deviation of a run in the place of the standard error."""
     row, runs, wanted = cell.row, cell.runs, float(expected.mean[cell.row])
     deviation, known = cell.error, expected.deviation is not None

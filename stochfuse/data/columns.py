@@ -45,7 +45,7 @@ SAMPLE = 10_000
 """Cells whose texts are kept, to see with how many digits they are given."""
 
 
-class Field(NamedTuple):
+class ColumnField(NamedTuple):
     """What a reader wants of a column.
 
     Parameters
@@ -74,7 +74,7 @@ class Field(NamedTuple):
         return f"{noun} of at least {self.least:g}" if np.isfinite(self.least) else noun
 
 
-Fields = Sequence[Field] | Callable[[Sequence[str]], Sequence[Field]]
+Fields = Sequence[ColumnField] | Callable[[Sequence[str]], Sequence[ColumnField]]
 """What is wanted; or what says so once the names of the columns are known."""
 Renamed = Mapping[str, str] | Callable[[Sequence[str]], Mapping[str, str]]
 """The table's names for columns by the fields'; or what says so once they are known."""
@@ -244,7 +244,7 @@ def _parts_of(table: OpenedTable, fields: Fields, renamed: Renamed, others: bool
         raise ColumnsError(f"{table.name}: no rows{under}; expected columns {_names(wanted)}")
 
 
-def _nothing(table: OpenedTable, wanted: Sequence[Field], skipped: tuple[str, ...]) -> Columns:
+def _nothing(table: OpenedTable, wanted: Sequence[ColumnField], skipped: tuple[str, ...]) -> Columns:
     """No rows, but with headings."""
     number = {field.name: np.zeros(0) for field in wanted if field.kind != TEXT}
     text = {field.name: Labels(np.zeros(0, dtype=np.int32), ()) for field in wanted if field.kind == TEXT}
@@ -257,13 +257,13 @@ def _written(raw: Raw, place: int) -> tuple[str, ...]:
     return tuple("" if _empty(cell) else str(cell) for cell in cells)
 
 
-def _names(wanted: Sequence[Field]) -> str:
+def _names(wanted: Sequence[ColumnField]) -> str:
     return ", ".join(field.name for field in wanted)
 
 
 def _matched(
     table: OpenedTable, fields: Fields, renamed: Renamed, others: bool
-) -> tuple[list[int], list[Field], tuple[str, ...]]:
+) -> tuple[list[int], list[ColumnField], tuple[str, ...]]:
     """Places and fields of the columns that are wanted and there, and the names of the others."""
     header = list(table.header)
     if not header:
@@ -316,7 +316,7 @@ def _place(name: str, names: Sequence[str | None]) -> int | None:
     return low.index(name.lower()) if name.lower() in low else None
 
 
-def _settled(field: Field, raw: Raw, place: int) -> Field:
+def _settled(field: ColumnField, raw: Raw, place: int) -> ColumnField:
     """The field, of labels as its first cell says: whole numbers or texts."""
     if field.kind != LABEL:
         return field
@@ -325,7 +325,7 @@ def _settled(field: Field, raw: Raw, place: int) -> Field:
 
 
 def _checked(
-    part: Columns, raw: Raw, places: Sequence[int], wanted: Sequence[Field], known: dict[str, dict[str, int]]
+    part: Columns, raw: Raw, places: Sequence[int], wanted: Sequence[ColumnField], known: dict[str, dict[str, int]]
 ) -> Columns:
     number, text, blank = {}, {}, {}
     for place, field in zip(places, wanted, strict=True):

@@ -24,11 +24,11 @@ from stochfuse.data.cells import Cell, Judged, of_means, of_runs
 from stochfuse.data.columns import Labels
 from stochfuse.data.expected import Family, families_of, knows
 from stochfuse.data.results import Observed, ResultsError, SimulatorResults, read_results
-from stochfuse.data.together import Block, blocks_of, together
+from stochfuse.data.together import LinkCells, blocks_of, together
 from stochfuse.errors import StochfuseError, UsageError, nearest
 from stochfuse.kalman.metrics import Metric
 from stochfuse.kalman.metrics import metric as metric_of
-from stochfuse.prediction.method import Shown
+from stochfuse.prediction.method import ShownPart
 from stochfuse.prediction.predict import predict
 from stochfuse.prediction.result import Prediction
 from stochfuse.scenario.network import LinkRows, stacked_rows
@@ -73,7 +73,7 @@ class Verdict(Result):
     results: SimulatorResults
     prediction: Prediction
     metric: Metric
-    blocks: tuple[Block, ...] = ()
+    blocks: tuple[LinkCells, ...] = ()
     evidence: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     causes: tuple[Cause, ...] = ()
@@ -145,7 +145,7 @@ def crosscheck(
     given = given.until(last)
     chosen = metric_of(metric or given.metric or "trace", given.model)
     rows, said = rows_of(read, given, link)
-    settings = {"shown": Shown(metrics=(chosen,), agent="worst"), **settings}
+    settings = {"shown": ShownPart(metrics=(chosen,), agent="worst"), **settings}
     prediction, unknown = _predicted(read, given, rows, method, {"estimator": estimator, **settings})
     read = replace(read, observed=tuple(o for o in read.observed if o.column not in unknown))
     said += [f"column {name} is not compared: {why}" for name, why in unknown.items()]

@@ -31,7 +31,7 @@ from stochfuse.data.results import Observed
 from stochfuse.errors import UsageError
 from stochfuse.kalman.metrics import Metric, Moments
 from stochfuse.prediction.result import Prediction
-from stochfuse.prediction.sampled import Sampled
+from stochfuse.prediction.sampled import MomentSample
 from stochfuse.scenario.registry import OPTIMAL
 
 FLAT = 1e-12
@@ -102,7 +102,7 @@ class Law(NamedTuple):
         return min(1.0, 2.0 * float(np.exp(min(0.0, runs * least.fun))))
 
 
-class Expected(NamedTuple):
+class ColumnExpectation(NamedTuple):
     """What is expected of one column, at one step and of one group of agents, in every row of the prediction.
 
     Parameters
@@ -212,7 +212,7 @@ class Expectations:
         if prediction.sampled is not None:
             self._drawn = [family.parts(prediction.sampled.sample.values) for family in families]
 
-    def at(self, step: int, group: int) -> list[Expected]:
+    def at(self, step: int, group: int) -> list[ColumnExpectation]:
         """Return what is expected at a step (from 1) of a group of agents, a family each."""
         p = self.prediction
         if p.outcomes is not None:
@@ -224,15 +224,15 @@ class Expectations:
         moments = p.moments.map(lambda M: M[:, step - 1, group])
         return [self._of_averages(family, moments) for family in self.families]
 
-    def _of_averages(self, family: Family, moments: Moments) -> Expected:
+    def _of_averages(self, family: Family, moments: Moments) -> ColumnExpectation:
         if family.quantity == "claimed":
-            return Expected(family.parts(moments).constant)
+            return ColumnExpectation(family.parts(moments).constant)
         parts = family.parts(moments)
         mean, variance, third = parts.cumulants
         one = np.ones(1)
         # the optimum claims what it achieves, in every outcome
         exact = family.quantity == "nees" and self.prediction.method == OPTIMAL
-        return Expected(
+        return ColumnExpectation(
             mean,
             np.sqrt(variance),
             _skewness(variance, third),
@@ -252,7 +252,7 @@ def knows(prediction: Prediction, family: Family) -> bool:
     return family.linear
 
 
-def _of_outcomes(probability: Callable[[int], np.ndarray], parts: Parts, rows: int) -> Expected:
+def _of_outcomes(probability: Callable[[int], np.ndarray], parts: Parts, rows: int) -> ColumnExpectation:
     means, variances, thirds = parts.cumulants
     mean, variance, third = np.empty(rows), np.empty(rows), np.empty(rows)
     for row in range(rows):
@@ -261,10 +261,10 @@ def _of_outcomes(probability: Callable[[int], np.ndarray], parts: Parts, rows: i
         variance[row], third[row] = _central(p, means - mean[row], variances, thirds)
     deviation = _deviation(mean, variance)
     skewness = _skewness(deviation**2, third)
-    return Expected(mean, deviation, skewness, lambda row: Law(probability(row), parts), exact=True)
+    return ColumnExpectation(mean, deviation, skewness, lambda row: Law(probability(row), parts), exact=True)
 
 
-def _of_sample(sampled: Sampled, parts: Parts, step: int, group: int) -> Expected:
+def _of_sample(sampled: MomentSample, parts: Parts, step: int, group: int) -> ColumnExpectation:
     agents, index = list(sampled.groups[group]), sampled.sample.which
     means, variances, thirds = parts.cumulants
     rows, runs = index.shape[:2]
@@ -284,7 +284,7 @@ def _of_sample(sampled: Sampled, parts: Parts, step: int, group: int) -> Expecte
 
     mean = drawn.mean(axis=1)
     deviation = _deviation(mean, variance)
-    return Expected(mean, deviation, _skewness(deviation**2, third), law, drawn=drawn)
+    return ColumnExpectation(mean, deviation, _skewness(deviation**2, third), law, drawn=drawn)
 
 
 def _central(p: np.ndarray, v: np.ndarray, variances: np.ndarray, thirds: np.ndarray) -> tuple[float, float]:

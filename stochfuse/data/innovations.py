@@ -54,7 +54,7 @@ class Supposition(NamedTuple):
         return self._replace(**fields)
 
 
-class Setting(NamedTuple):
+class InnovationSetting(NamedTuple):
     """What all cases have in common.
 
     Parameters
@@ -101,19 +101,19 @@ class Innovations(NamedTuple):
         return float((white[there] ** 2).mean()) if there.any() else np.nan
 
 
-def setting_of(system: System, functions: Sequence[Function | None], first: Sequence[np.ndarray]) -> Setting:
+def setting_of(system: System, functions: Sequence[Function | None], first: Sequence[np.ndarray]) -> InnovationSetting:
     """Return what cases of a record have in common; see `Setting`."""
     functions = tuple(functions) or (None,) * system.agents
-    return Setting(system, functions, tuple(first), together=system.one_state and system.noise is None)
+    return InnovationSetting(system, functions, tuple(first), together=system.one_state and system.noise is None)
 
 
-def innovations(setting: Setting, cases: Sequence[Supposition]) -> Innovations:
+def innovations(setting: InnovationSetting, cases: Sequence[Supposition]) -> Innovations:
     """Filter what each case says was measured; see the module."""
     with np.errstate(all="ignore"):
         return _Filters(setting, cases).run()
 
 
-def estimates(setting: Setting, case: Supposition) -> Estimate:
+def estimates(setting: InnovationSetting, case: Supposition) -> Estimate:
     """Return x (runs, steps − 1, filters, d) and P of the filters of a case, from step 2 on."""
     with np.errstate(all="ignore"):
         filters = _Filters(setting, [case])
@@ -124,7 +124,7 @@ def estimates(setting: Setting, case: Supposition) -> Estimate:
 class _Filters:
     """The filters of all cases, one over all agents or one for each."""
 
-    def __init__(self, setting: Setting, cases: Sequence[Supposition]) -> None:
+    def __init__(self, setting: InnovationSetting, cases: Sequence[Supposition]) -> None:
         self.world: World = world_of(setting.system)
         self.setting, self.cases = setting, cases
         runs, self.steps = cases[0].z[0].shape[:2]

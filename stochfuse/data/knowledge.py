@@ -83,7 +83,7 @@ class Claim(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Setting:
+class AgentSetting:
     """What an agent is told.
 
     Parameters
@@ -146,7 +146,7 @@ class Knowledge:
     life, step : its name, and the step of its first estimate.
     """
 
-    def __init__(self, setting: Setting, life: Life, step: int) -> None:
+    def __init__(self, setting: AgentSetting, life: Life, step: int) -> None:
         self.setting, self.life, self.now, self.begun = setting, life, step, step
         self.nodes: dict[Name, Node] = {}
         self.worth: dict[Vector, Worth] = {}
@@ -301,7 +301,7 @@ class Gossip(Knowledge):
 class Graph(Gossip):
     """The Local Fusion Graph of what is held."""
 
-    def __init__(self, setting: Setting, life: Life, step: int) -> None:
+    def __init__(self, setting: AgentSetting, life: Life, step: int) -> None:
         super().__init__(setting, life, step)
         first = setting.first()
         # a shared first estimate is a common ancestor of all, which everyone has
@@ -417,7 +417,7 @@ class UnknownError(Exception):
         self.value = value
 
 
-class _Sums:
+class _InformationSums:
     """Information pairs in the place of a ledger's values, for `Pedigrees`; None: not held."""
 
     def __init__(self, forward: Callable[[Information, int], Information]) -> None:
@@ -452,7 +452,7 @@ class _Search:
     """Pedigrees of nodes, and of those that they name but that are not held, as masks, earlier steps first."""
 
     def __init__(
-        self, setting: Setting, nodes: Sequence[Node], root: Information | None, worth: Mapping[Vector, Worth]
+        self, setting: AgentSetting, nodes: Sequence[Node], root: Information | None, worth: Mapping[Vector, Worth]
     ) -> None:
         held = {node.name: node for node in nodes}
         named = {name for node in nodes for name in node.known.items()} | {name for vector in worth for name in vector}
@@ -465,7 +465,7 @@ class _Search:
             steps, masks = self._up_to.setdefault(life, ([], []))
             steps.append(step)
             masks.append((masks[-1] if masks else 0) | 1 << place)
-        self.sums = _Sums(setting.forward)
+        self.sums = _InformationSums(setting.forward)
         values, below = [], []
         for name in self.order:
             node = held.get(name)
@@ -528,7 +528,7 @@ class _Search:
 class Measured(Gossip):
     """All measurements of a pedigree, in one filter; what all hold of them is folded into one estimate."""
 
-    def __init__(self, setting: Setting, life: Life, step: int) -> None:
+    def __init__(self, setting: AgentSetting, life: Life, step: int) -> None:
         super().__init__(setting, life, step)
         first, nothing = setting.first(), Information(*(0.0 * part for part in setting.first()))
         begins = setting.shared and step == 1
@@ -591,7 +591,7 @@ class Latest(Knowledge):
     """One estimate a message, fused by the estimator itself, or added up."""
 
     def __init__(
-        self, setting: Setting, life: Life, step: int, estimator: RecursiveEstimator | None, late: bool
+        self, setting: AgentSetting, life: Life, step: int, estimator: RecursiveEstimator | None, late: bool
     ) -> None:
         super().__init__(setting, life, step)
         self.seen: dict[Life, set[int]] = {}
@@ -641,7 +641,7 @@ class Latest(Knowledge):
         if self.estimator is not None:
             fused, numbers = self._fused(self.estimator)
             return Claim(Estimate(numbers[fused].x[0], numbers[fused].P[0]), known)
-        sums = _Sums(self.setting.forward)
+        sums = _InformationSums(self.setting.forward)
         terms = [(sums.add(n.step, Information(n.v, n.M[0])), 1) for n in (self.own, *self._here())]
         information = sums.at(sums.combine(self.now, terms), self.now)
         return Claim(from_information(information), known, information)
@@ -715,7 +715,7 @@ def _join(known: dict[Life, int], more: Any) -> None:
 
 
 def knowledge_of(
-    setting: Setting, life: Life, step: int, estimator: RecursiveEstimator | None, late: bool
+    setting: AgentSetting, life: Life, step: int, estimator: RecursiveEstimator | None, late: bool
 ) -> Knowledge:
     """Return what an agent of an estimator knows at its first step.
 

@@ -197,7 +197,7 @@ def decode(data: Any, kind: Kind) -> list[Node]:
     least = HEAD.size + 3 * B + N * (1 + B + 8 * width) + SUM.size
     if not 1 <= N <= kind.most or not 1 <= B <= LIVES * agents or len(data) < least or not d:
         _refuse(f"1 to {kind.most} nodes that fit into {len(data)} bytes", f"{N} of {B} lives")
-    reader = _Reader(data, HEAD.size, len(data) - SUM.size)
+    reader = _VarintReader(data, HEAD.size, len(data) - SUM.size)
     latest = {Life(reader.next(), reader.next()): reader.next() for _ in range(B)}
     lives = list(latest)
     if len(lives) != B or any(life.agent >= agents for life in lives) or not all(latest.values()):
@@ -213,7 +213,7 @@ def decode(data: Any, kind: Kind) -> list[Node]:
     return [Node(*names[i], vectors[i], v[i], tuple(M[i])) for i in range(N)]
 
 
-def _pedigrees(reader: _Reader, nodes: int, latest: Mapping[Life, int]) -> tuple[np.ndarray, list[Name]]:
+def _pedigrees(reader: _VarintReader, nodes: int, latest: Mapping[Life, int]) -> tuple[np.ndarray, list[Name]]:
     """What every node knows of every life, (N, B), and the nodes' names, seen to be possible."""
     lives, last = list(latest), np.array(list(latest.values()), dtype=np.int64)
     known, whose = np.empty((nodes, len(lives)), dtype=np.int64), np.empty(nodes, dtype=np.int64)
@@ -274,7 +274,7 @@ def smallest(M: np.ndarray, scale: np.ndarray | None = None) -> np.ndarray:
     return np.where(fine, np.linalg.eigvalsh(np.where(fine[:, None, None], scaled, 0.0))[:, 0], -1.0)
 
 
-class _Reader:
+class _VarintReader:
     """Varints of a message, one after the other."""
 
     def __init__(self, data: bytes, place: int, end: int) -> None:

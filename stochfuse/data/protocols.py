@@ -40,7 +40,7 @@ RUNS, GROUPS = 200, 20
 QUANTITIES = ("claimed", "actual", "consistency", "bias", "rms")
 
 
-class Sampled(NamedTuple):
+class SampledLoad(NamedTuple):
     """A number for each row, and its standard error."""
 
     values: np.ndarray
@@ -98,7 +98,7 @@ class ProtocolLoad(Result):
         lived = tuple(Lived(*(part[:, :, inside] for part in each)) for each in self.lived)
         return replace(self, steps=self.steps[inside], lived=lived)
 
-    def load(self, protocol: int, what: str = "nodes", agent: int | str = "mean") -> Sampled:
+    def load(self, protocol: int, what: str = "nodes", agent: int | str = "mean") -> SampledLoad:
         """Nodes, bytes or estimates `apart` that a step brings an agent, on average.
 
         Parameters
@@ -109,7 +109,9 @@ class ProtocolLoad(Result):
         runs = getattr(self.lived[protocol], what)[..., self._agents(agent)].mean(axis=(2, 3))
         return _over_runs(lambda chosen: runs[:, chosen].mean(axis=1), self.runs)
 
-    def accuracy(self, protocol: int, metric: Metric, quantity: str = "actual", agent: int | str = "mean") -> Sampled:
+    def accuracy(
+        self, protocol: int, metric: Metric, quantity: str = "actual", agent: int | str = "mean"
+    ) -> SampledLoad:
         """Metric of the averages over runs, averaged over the steps of the window.
 
         Raises
@@ -140,12 +142,12 @@ class ProtocolLoad(Result):
         raise UsageError(f"agent: expected mean or a number from 1 to {n}, got '{agent}'")
 
 
-def _over_runs(value: Callable[[np.ndarray], np.ndarray], runs: int) -> Sampled:
+def _over_runs(value: Callable[[np.ndarray], np.ndarray], runs: int) -> SampledLoad:
     """A number over all runs, and its standard error by leaving out groups of them in turn."""
     everyone, groups = np.arange(runs), min(GROUPS, runs)
     without = np.stack([value(everyone[everyone % groups != group]) for group in range(groups)])
     spread = ((without - without.mean(axis=0)) ** 2).sum(axis=0)
-    return Sampled(value(everyone), np.sqrt(spread * (groups - 1) / groups))
+    return SampledLoad(value(everyone), np.sqrt(spread * (groups - 1) / groups))
 
 
 @of_scenario
@@ -191,7 +193,7 @@ def protocol_load(
         raise UsageError("sensor.detection: expected sensors that do not miss for loads of live agents")
     world, seen = world_of(system), np.zeros((runs, system.steps, system.agents), dtype=bool)
     records = [drawn_arrivals(system, rows.take(np.array([row])), seen, seed) for row in range(len(rows.link))]
-    made = _Network(scenario, estimator, world, Footprints(world), len(policies) * len(records) * runs)
+    made = _ProtocolAgents(scenario, estimator, world, Footprints(world), len(policies) * len(records) * runs)
     lived = [[made.lived(policy, record) for record in records] for policy in policies]
     stacked = tuple(Lived(*(np.stack(part) for part in zip(*each, strict=True))) for each in lived)
     return ProtocolLoad(
@@ -208,7 +210,7 @@ def protocol_load(
     )
 
 
-class _Network:
+class _ProtocolAgents:
     """Agents of a scenario that live through records."""
 
     def __init__(self, scenario: Scenario, estimator: str, world: World, riding: Footprints, total: int) -> None:

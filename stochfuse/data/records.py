@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.data.columns import TEXT, WHOLE, Columns, ColumnsError, Field, Labels, read_columns
+from stochfuse.data.columns import TEXT, WHOLE, ColumnField, Columns, ColumnsError, Labels, read_columns
 from stochfuse.engines.replay import ArrivalRecord
 from stochfuse.errors import StochfuseError, UsageError, nearest
 from stochfuse.estimators.protocol import Late
@@ -64,7 +64,7 @@ class RunRows(NamedTuple):
         return self.run[first:last] - runs.start, self.where[first:last], self.values[first:last]
 
 
-class Batch(NamedTuple):
+class RecordedRuns(NamedTuple):
     """Some runs.
 
     Parameters
@@ -120,7 +120,7 @@ class Records:
         """Whether there is any truth."""
         return self.truth is not None
 
-    def batches(self) -> Iterator[Batch]:
+    def batches(self) -> Iterator[RecordedRuns]:
         """Go through the runs, some at a time."""
         network = self.scenario.network
         size = max(1, NUMBERS // (network.agents * network.steps))
@@ -144,7 +144,7 @@ class Records:
         out[where[:, 0], where[:, 1]] = values[:, : out.shape[2]]
         return out
 
-    def _batch(self, runs: slice) -> Batch:
+    def _batch(self, runs: slice) -> RecordedRuns:
         system = self.scenario.system
         count, steps, n, d = runs.stop - runs.start, system.steps, system.agents, system.dimension
         run, where, values = self.measurements.of(runs)
@@ -158,7 +158,7 @@ class Records:
             missed[:, :, agent] = np.isnan(filled[..., 0]) & looked if H.any() else False
             z.append(np.nan_to_num(filled))
         missed[:, 0] = False
-        return Batch(
+        return RecordedRuns(
             np.arange(runs.start, runs.stop),
             tuple(z),
             self._related(runs),
@@ -267,7 +267,7 @@ def read_records(
     UsageError
         If a file is malformed or does not fit the scenario; names line and column.
     """
-    read = _Reader(scenario, dict(columns or {}))
+    read = _ScenarioReader(scenario, dict(columns or {}))
     tables = {
         "measurements": read.measurements(measurements),
         "arrivals": None if arrivals is None else read.arrivals(arrivals),
@@ -301,7 +301,7 @@ def _taken(rows: RunRows, which: np.ndarray) -> RunRows:
     return RunRows(None if rows.run is None else rows.run[which], rows.where[which], rows.values[which])
 
 
-def _check_steps(last: int, tables: Mapping[str, _Given]) -> None:
+def _check_steps(last: int, tables: Mapping[str, _RawTable]) -> None:
     """Raise UsageError if hardly any of the steps are spoken of: these are times, or one of them is a slip."""
     different = len(np.unique(np.concatenate([table.where[:, 0] for table in tables.values()])))
     if last <= MANY or last <= SPARSE * different:
@@ -314,7 +314,7 @@ def _check_steps(last: int, tables: Mapping[str, _Given]) -> None:
     )
 
 
-def _lengthened(scenario: Scenario, last: int, tables: Mapping[str, _Given]) -> Scenario:
+def _lengthened(scenario: Scenario, last: int, tables: Mapping[str, _RawTable]) -> Scenario:
     """The scenario with as many steps as the records have."""
     steps = scenario.network.steps
     if last == steps:
@@ -334,7 +334,7 @@ def _lengthened(scenario: Scenario, last: int, tables: Mapping[str, _Given]) -> 
     return replace(longer, name=scenario.name)
 
 
-def _runs(tables: Mapping[str, _Given]) -> tuple[str, ...]:
+def _runs(tables: Mapping[str, _RawTable]) -> tuple[str, ...]:
     """Names of the runs, numbers in their order; every file that has runs has all of them."""
     found: dict[str, None] = {}
     for table in tables.values():
@@ -357,7 +357,7 @@ def _runs(tables: Mapping[str, _Given]) -> tuple[str, ...]:
     return tuple(names)
 
 
-class _Given(NamedTuple):
+class _RawTable(NamedTuple):
     """A table as it was read, checked but for its runs."""
 
     columns: Columns
@@ -386,7 +386,7 @@ class _Given(NamedTuple):
         return RunRows(run[order], self.where[order], self.values[order])
 
 
-class _Reader:
+class _ScenarioReader:
     """Reads the files of a scenario; knows its agents and states."""
 
     def __init__(self, scenario: Scenario, renamed: dict[str, str]) -> None:
@@ -397,17 +397,19 @@ class _Reader:
         network = scenario.network
         self.agents = {str(i + 1): i for i in range(network.agents)} | {name: i for i, name in enumerate(network.names)}
 
-    def columns(self, source: Any, fields: Callable[[Sequence[str]], list[Field]], empty: bool = False) -> Columns:
+    def columns(
+        self, source: Any, fields: Callable[[Sequence[str]], list[ColumnField]], empty: bool = False
+    ) -> Columns:
         """Columns of a file, those that have other names there among them."""
 
-        def asked(names: Sequence[str]) -> list[Field]:
+        def asked(names: Sequence[str]) -> list[ColumnField]:
             found = fields(names)
             self.used |= {field.name for field in found}
             return found
 
         return read_columns(source, asked, lambda names: self._renamed_in(names, fields), empty=empty)
 
-    def _renamed_in(self, names: Sequence[str], fields: Callable[[Sequence[str]], list[Field]]) -> dict[str, str]:
+    def _renamed_in(self, names: Sequence[str], fields: Callable[[Sequence[str]], list[ColumnField]]) -> dict[str, str]:
         """Those of the given names that a file has, of columns that are wanted of it."""
         self.seen.update(dict.fromkeys(names))
         here = {ours: theirs for ours, theirs in self.renamed.items() if theirs in names}
@@ -426,16 +428,22 @@ class _Reader:
                     f"columns: no file has a column '{theirs}'{nearest(theirs, self.seen)}, to be used as '{ours}'"
                 )
 
-    def measurements(self, source: Any) -> _Given:
+    def measurements(self, source: Any) -> _RawTable:
         """Measurements, and those of other agents: keys step, agent, agent that was measured or −1."""
         widths = [self._width(i) for i in range(len(self.scenario.sensor_of))]
         related = [relation.R.shape[-1] for relation in self.scenario.relations.values()]
         most = max([*widths, *related, 1])
 
-        def fields(names: Sequence[str]) -> list[Field]:
-            z = [Field(f"z{i}", blank=True, free=True, required=i == 1) for i in range(1, most + 1)]
-            own = [Field("of", TEXT, required=False, blank=True)] if self.scenario.relations else []
-            return [Field("run", TEXT, required=False), Field("step", WHOLE, 1), Field("agent", TEXT), *own, *z]
+        def fields(names: Sequence[str]) -> list[ColumnField]:
+            z = [ColumnField(f"z{i}", blank=True, free=True, required=i == 1) for i in range(1, most + 1)]
+            own = [ColumnField("of", TEXT, required=False, blank=True)] if self.scenario.relations else []
+            return [
+                ColumnField("run", TEXT, required=False),
+                ColumnField("step", WHOLE, 1),
+                ColumnField("agent", TEXT),
+                *own,
+                *z,
+            ]
 
         found = self.columns(source, fields)
         agent = self._agent(found, "agent")
@@ -474,23 +482,23 @@ class _Reader:
             values = np.concatenate([values, np.full((len(values), most - values.shape[1]), np.nan)], axis=1)
         return self._once(found, where, values, notes, step > 0)
 
-    def arrivals(self, source: Any) -> _Given:
+    def arrivals(self, source: Any) -> _RawTable:
         """Messages: keys step, receiver, sender, step of sending."""
 
-        def fields(names: Sequence[str]) -> list[Field]:
-            ends = [Field("receiver", TEXT), Field("sender", TEXT)]
+        def fields(names: Sequence[str]) -> list[ColumnField]:
+            ends = [ColumnField("receiver", TEXT), ColumnField("sender", TEXT)]
             if "step" not in names and "seq" in names:
                 return [
-                    Field("run", TEXT, required=False),
-                    Field("seq", WHOLE, 0),
+                    ColumnField("run", TEXT, required=False),
+                    ColumnField("seq", WHOLE, 0),
                     *ends,
-                    Field("received", WHOLE, 0, required=False),
+                    ColumnField("received", WHOLE, 0, required=False),
                 ]
             return [
-                Field("run", TEXT, required=False),
-                Field("step", WHOLE, 1),
+                ColumnField("run", TEXT, required=False),
+                ColumnField("step", WHOLE, 1),
                 *ends,
-                Field("sent_step", WHOLE, 1, required=False, blank=True),
+                ColumnField("sent_step", WHOLE, 1, required=False, blank=True),
             ]
 
         found = self.columns(source, fields, empty=True)
@@ -520,7 +528,7 @@ class _Reader:
         if (again & there).any():
             notes.append(f"{found.source}: {int((again & there).sum())} messages came again; the first time counts")
         kept = there & ~again
-        return _Given(
+        return _RawTable(
             found,
             self._run(found, kept),
             where[kept],
@@ -529,23 +537,23 @@ class _Reader:
             np.flatnonzero(kept),
         )
 
-    def truth(self, source: Any) -> _Given:
+    def truth(self, source: Any) -> _RawTable:
         """True states: keys step, agent or −1 for all."""
         states = self.scenario.model.states
         own = not self.scenario.system.one_state
         shown: list[str] = []
 
-        def fields(names: Sequence[str]) -> list[Field]:
+        def fields(names: Sequence[str]) -> list[ColumnField]:
             shown[:] = [state for state in states if state in names]
             if not shown:
                 raise UsageError(
                     f"truth: expected states as columns, some of {', '.join(states)}; got {', '.join(names)}"
                 )
-            given = [Field(state, blank=True) for state in shown]
+            given = [ColumnField(state, blank=True) for state in shown]
             return [
-                Field("run", TEXT, required=False),
-                Field("step", WHOLE, 1),
-                Field("agent", TEXT, required=own),
+                ColumnField("run", TEXT, required=False),
+                ColumnField("step", WHOLE, 1),
+                ColumnField("agent", TEXT, required=own),
                 *given,
             ]
 
@@ -561,10 +569,10 @@ class _Reader:
             notes.append(f"{found.source}: nothing is known of {lost}: NEES is that of {', '.join(shown)}")
         return self._once(found, np.stack([step, agent], axis=1), values, notes, np.ones(len(found), dtype=bool))
 
-    def first(self, source: Any) -> _Given:
+    def first(self, source: Any) -> _RawTable:
         """First estimates: keys 0, agent."""
         states = self.scenario.model.states
-        given = [Field("run", TEXT, required=False), Field("agent", TEXT), *map(Field, states)]
+        given = [ColumnField("run", TEXT, required=False), ColumnField("agent", TEXT), *map(ColumnField, states)]
         found = self.columns(source, lambda _: given)
         agent = self._agent(found, "agent")
         values = np.stack([found.number[state] for state in states], axis=1)
@@ -650,7 +658,7 @@ class _Reader:
 
     def _once(
         self, found: Columns, where: np.ndarray, values: np.ndarray, notes: list[str], there: np.ndarray
-    ) -> _Given:
+    ) -> _RawTable:
         """Rows that are there, each once; two that say different things of the same are an error."""
         again = self._again(found, where, np.arange(len(found)))
         if again.any():
@@ -668,4 +676,4 @@ class _Reader:
                 )
             notes.append(f"{found.source}: {int(again.sum())} rows are there twice, and count once")
         kept = there & ~again
-        return _Given(found, self._run(found, kept), where[kept], values[kept], tuple(notes), np.flatnonzero(kept))
+        return _RawTable(found, self._run(found, kept), where[kept], values[kept], tuple(notes), np.flatnonzero(kept))

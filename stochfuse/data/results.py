@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.data.columns import LABEL, NUMBER, TEXT, WHOLE, Columns, ColumnsError, Field, Labels, read_columns
+from stochfuse.data.columns import LABEL, NUMBER, TEXT, WHOLE, ColumnField, Columns, ColumnsError, Labels, read_columns
 
 MEASURED = ("covariance", "error", "squared_error", "nees")
 """Columns of values, in the order in which they are compared; what follows a colon says of what."""
@@ -142,7 +142,7 @@ def read_results(source: Any, columns: Mapping[str, str] | None = None) -> Simul
     return results
 
 
-def _fields(names: Sequence[str]) -> list[Field]:
+def _fields(names: Sequence[str]) -> list[ColumnField]:
     """Columns that there must and may be; of values those that the table has."""
     low = [name.lower() for name in names]
     found = [f"{kind}:{of}" if of else kind for name in names for kind, of in [_measured(name)] if kind]
@@ -151,21 +151,21 @@ def _fields(names: Sequence[str]) -> list[Field]:
     values = [_value(name, required=True, blank=several or name == "error") for name in found or ["covariance"]]
     values += [_value(name, required=False) for name in MEASURED if name not in (found or ["covariance"])]
     fields = [
-        Field("agent", LABEL, 1, required=False),
-        Field("step", WHOLE, 1),
-        Field("link", TEXT, required=False, blank=True),
+        ColumnField("agent", LABEL, 1, required=False),
+        ColumnField("step", WHOLE, 1),
+        ColumnField("link", TEXT, required=False, blank=True),
         *values,
     ]
     if "count" not in low:
-        return [Field("run", LABEL, 0), *fields]
+        return [ColumnField("run", LABEL, 0), *fields]
     deviations = dict.fromkeys(["std", *(name for name in low if name.startswith("std:"))])
-    spread = [Field(name, NUMBER, 0, required=False, blank=True) for name in deviations]
-    return [*fields, Field("count", WHOLE, 2), *spread]
+    spread = [ColumnField(name, NUMBER, 0, required=False, blank=True) for name in deviations]
+    return [*fields, ColumnField("count", WHOLE, 2), *spread]
 
 
-def _value(name: str, *, required: bool, blank: bool = True) -> Field:
+def _value(name: str, *, required: bool, blank: bool = True) -> ColumnField:
     least = -np.inf if name.partition(":")[0] == "error" else 0.0
-    return Field(name, NUMBER, least, required=required, blank=blank, free=True)
+    return ColumnField(name, NUMBER, least, required=required, blank=blank, free=True)
 
 
 def _measured(name: str) -> tuple[str, str]:

@@ -90,7 +90,7 @@ class Channel(NamedTuple):
         return Channel(self.mean, none, Process(none, 1.0), Process(none, 1.0), total, none + 1.0, self.number)
 
 
-class Noises(NamedTuple):
+class ChannelNoises(NamedTuple):
     """All channels, the speed lost in turning [m/s per rad/s], and the share of gross errors among sightings."""
 
     speed: Channel
@@ -100,7 +100,7 @@ class Noises(NamedTuple):
     turning_loss: float
     gross: float
 
-    def white(self) -> Noises:
+    def white(self) -> ChannelNoises:
         """Return them as white noise takes them: at face value."""
         return self._replace(
             speed=self.speed.as_white(),
@@ -110,7 +110,7 @@ class Noises(NamedTuple):
         )
 
 
-class _Errors(NamedTuple):
+class _ChannelErrors(NamedTuple):
     """Errors of a channel: time, robot, subject, error and size, each (errors,)."""
 
     time: np.ndarray
@@ -120,7 +120,7 @@ class _Errors(NamedTuple):
     size: np.ndarray
 
 
-def identify(record: RobotRecord, start: float = 0.0, stop: float = 60.0) -> Noises:
+def identify(record: RobotRecord, start: float = 0.0, stop: float = 60.0) -> ChannelNoises:
     """Identify all noises on a part of a record where the truth is used.
 
     Parameters
@@ -142,10 +142,10 @@ def identify(record: RobotRecord, start: float = 0.0, stop: float = 60.0) -> Noi
     channels = (_channel(name, errors, n) for name, errors in zip(
         ("speed", "turn_rate", "range", "bearing"), (speed, turn, ranges, bearings), strict=True
     ))  # fmt: skip
-    return Noises(*channels, turning_loss=loss, gross=gross)
+    return ChannelNoises(*channels, turning_loss=loss, gross=gross)
 
 
-def _odometry(record: RobotRecord, first: int, last: int) -> tuple[_Errors, _Errors, float]:
+def _odometry(record: RobotRecord, first: int, last: int) -> tuple[_ChannelErrors, _ChannelErrors, float]:
     """Errors of averages over blocks."""
     T, truth = record.interval, record.truth[first : last + 1]
     size = max(1, round(BLOCK / T))
@@ -164,10 +164,10 @@ def _odometry(record: RobotRecord, first: int, last: int) -> tuple[_Errors, _Err
     time = np.broadcast_to((np.arange(blocks) * size * T)[:, None], V.shape)
     robot = np.broadcast_to(np.arange(V.shape[1]), V.shape)
     parts = (time.ravel(), robot.ravel(), np.zeros(V.size, dtype=int))
-    return _Errors(*parts, speed.ravel(), V.ravel()), _Errors(*parts, turn.ravel(), omega.ravel()), loss
+    return _ChannelErrors(*parts, speed.ravel(), V.ravel()), _ChannelErrors(*parts, turn.ravel(), omega.ravel()), loss
 
 
-def _sights(record: RobotRecord, first: int, last: int) -> tuple[_Errors, _Errors, float]:
+def _sights(record: RobotRecord, first: int, last: int) -> tuple[_ChannelErrors, _ChannelErrors, float]:
     """Errors of ranges and bearings, gross ones left out."""
     sightings = record.sightings.where((record.sightings.step >= first) & (record.sightings.step < last))
     true, _ = seen(record.truth[sightings.step, sightings.robot], record.subject_places(sightings))
@@ -181,10 +181,10 @@ def _sights(record: RobotRecord, first: int, last: int) -> tuple[_Errors, _Error
     parts = (sightings.step[kept] * record.interval, sightings.robot[kept], sightings.subject[kept])
     ones = np.ones(int(kept.sum()))
     gross = float(1.0 - kept.mean()) if len(kept) else 0.0
-    return _Errors(*parts, relative[kept], ones), _Errors(*parts, beside[kept], ones), gross
+    return _ChannelErrors(*parts, relative[kept], ones), _ChannelErrors(*parts, beside[kept], ones), gross
 
 
-def _channel(name: str, errors: _Errors, n: int) -> Channel:
+def _channel(name: str, errors: _ChannelErrors, n: int) -> Channel:
     if len(errors.time) < FEWEST or not errors.size.any():
         raise UsageError(f"{name}: expected {FEWEST} errors or more to identify its noise by, got {len(errors.time)}")
     number = np.bincount(errors.robot, minlength=n)
@@ -206,12 +206,12 @@ def _ratio(top: np.ndarray, bottom: np.ndarray) -> np.ndarray:
     return np.divide(top, bottom, out=np.zeros(np.shape(top)), where=bottom > 0)
 
 
-def _effective(errors: _Errors, n: int) -> np.ndarray:
+def _effective(errors: _ChannelErrors, n: int) -> np.ndarray:
     """As how many a robot's errors count where only some are large, were they white."""
     return _ratio(np.bincount(errors.robot, errors.size**2, n) ** 2, np.bincount(errors.robot, errors.size**4, n))
 
 
-class _Pairs(NamedTuple):
+class _ErrorPairs(NamedTuple):
     """Pairs of errors of one robot, first before second: their places, lag [s], and whether of one subject."""
 
     first: np.ndarray
@@ -220,7 +220,7 @@ class _Pairs(NamedTuple):
     same: np.ndarray
 
 
-def _pairs(errors: _Errors) -> _Pairs:
+def _pairs(errors: _ChannelErrors) -> _ErrorPairs:
     found = []
     for robot in np.unique(errors.robot):
         rows = np.flatnonzero(errors.robot == robot)
@@ -230,10 +230,12 @@ def _pairs(errors: _Errors) -> _Pairs:
         near = lag <= LONGEST
         first, second = first[near], second[near]
         found.append((first, second, lag[near], errors.subject[first] == errors.subject[second]))
-    return _Pairs(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+    return _ErrorPairs(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
-def _processes(errors: _Errors, residual: np.ndarray) -> tuple[tuple[float, float, float], _Pairs, tuple[float, float]]:
+def _processes(
+    errors: _ChannelErrors, residual: np.ndarray
+) -> tuple[tuple[float, float, float], _ErrorPairs, tuple[float, float]]:
     """Shares of the variance (common, subject, white), pairs of errors, and correlation times, robots pooled."""
     pairs, u = _pairs(errors), errors.size
     several = not pairs.same.all()
@@ -276,7 +278,7 @@ def _memory(bins: np.ndarray, products: np.ndarray, sizes: np.ndarray) -> tuple[
 
 
 def _design(
-    errors: _Errors, pairs: _Pairs, shares: tuple[float, float, float], times: tuple[float, float], n: int
+    errors: _ChannelErrors, pairs: _ErrorPairs, shares: tuple[float, float, float], times: tuple[float, float], n: int
 ) -> np.ndarray:
     """D of each robot, (robots,)."""
     rho = shares[0] * np.exp(-pairs.lag / times[0]) + pairs.same * shares[1] * np.exp(-pairs.lag / times[1])

@@ -36,7 +36,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stochfuse.data.robot_errors import BLOCK, Noises
+from stochfuse.data.robot_errors import BLOCK, ChannelNoises
 from stochfuse.data.robots import RobotRecord, moved, seen, wrapped
 from stochfuse.fusion.cooperative import lwin_update
 from stochfuse.kalman.algebra import NUMPY
@@ -64,7 +64,7 @@ class Assumed(NamedTuple):
         return Assumed(self.Q * factor[:, None], self.R * factor[:, None])
 
 
-def assumed(record: RobotRecord, noises: Noises, last: int) -> Assumed:
+def assumed(record: RobotRecord, noises: ChannelNoises, last: int) -> Assumed:
     """White noises of the same weight over long times: each channel's variance times its D.
 
     Odometry errs in proportion to what it measures; the filters take its mean square up to step `last`.
@@ -75,7 +75,7 @@ def assumed(record: RobotRecord, noises: Noises, last: int) -> Assumed:
     return Assumed(np.stack(rates, axis=1) * np.maximum(size, 1e-8), np.stack(sights, axis=1))
 
 
-class Event(NamedTuple):
+class Sighting(NamedTuple):
     """One sighting: its place in the record, who, whom (robots below n), range and bearing."""
 
     at: int
@@ -84,7 +84,7 @@ class Event(NamedTuple):
     measured: np.ndarray
 
 
-class Course(NamedTuple):
+class RobotPath(NamedTuple):
     """A record made ready for filters: constants taken out, sightings by step.
 
     Parameters
@@ -97,11 +97,11 @@ class Course(NamedTuple):
 
     record: RobotRecord
     motion: np.ndarray
-    events: tuple[tuple[Event, ...], ...]
+    events: tuple[tuple[Sighting, ...], ...]
     pairs: int
 
 
-def course(record: RobotRecord, noises: Noises) -> Course:
+def course(record: RobotRecord, noises: ChannelNoises) -> RobotPath:
     """Take the identified constants out of a record."""
     V, omega = record.odometry[..., 0], record.odometry[..., 1]
     V = V * (1.0 - noises.speed.mean) - noises.turning_loss * np.abs(omega)
@@ -111,13 +111,13 @@ def course(record: RobotRecord, noises: Noises) -> Course:
         [s.range / (1.0 + noises.range.mean[s.robot]), wrapped(s.bearing - noises.bearing.mean[s.robot])], axis=1
     )
     number = np.cumsum(s.subject < n) - 1
-    events: list[list[Event]] = [[] for _ in range(record.steps)]
+    events: list[list[Sighting]] = [[] for _ in range(record.steps)]
     for k, step in enumerate(s.step):
-        events[step].append(Event(int(number[k]), int(s.robot[k]), int(s.subject[k]), measured[k]))
-    return Course(record, motion, tuple(map(tuple, events)), int((s.subject < n).sum()))
+        events[step].append(Sighting(int(number[k]), int(s.robot[k]), int(s.subject[k]), measured[k]))
+    return RobotPath(record, motion, tuple(map(tuple, events)), int((s.subject < n).sum()))
 
 
-class Claims:
+class RobotCovariances:
     """Covariances that the filters claim: P (items, robots, 3, 3), of itns the joint one (items, 3n, 3n).
 
     `own` is, for split-ci, the part that the step's own odometry and sightings of landmarks brought.
@@ -277,7 +277,7 @@ class Followed:
     innovations y to take, and takes a sighting in: gain K (items, 3·rows, 2) on the rows of some robots.
     """
 
-    def __init__(self, course: Course, items: int) -> None:
+    def __init__(self, course: RobotPath, items: int) -> None:
         self.course = course
         self.x = np.broadcast_to(course.record.truth[0], (items, *course.record.truth.shape[1:])).copy()
         self.left_out = np.zeros(self.x.shape[:2], dtype=int)
@@ -296,19 +296,19 @@ class Followed:
         self.left_out[:, robot] = np.where(fine, 0, self.left_out[:, robot] + 1)
         return fine[:, None, None]
 
-    def correct(self, event: Event, rows: list[int], K: np.ndarray, H: dict[int, np.ndarray], y: np.ndarray) -> None:
+    def correct(self, event: Sighting, rows: list[int], K: np.ndarray, H: dict[int, np.ndarray], y: np.ndarray) -> None:
         change = (K @ y[..., None])[..., 0]
         self.x[:, rows] += change.reshape(len(change), len(rows), 3)
 
 
-class Expected:
+class RobotMoments:
     """Second moments of the errors along a path (steps, robots, 3): E (items, 3n, 3n) and M (items, 3n, biases).
 
     Biases are, for every robot, constant and process of speed and of turn rate, then constants and common processes
     of range and bearing, then range and bearing of every subject.
     """
 
-    def __init__(self, course: Course, noises: Noises, path: np.ndarray, items: int) -> None:
+    def __init__(self, course: RobotPath, noises: ChannelNoises, path: np.ndarray, items: int) -> None:
         record = course.record
         self.course, self.noises, self.path, self.n = course, noises, path, len(record.robots)
         self.subjects = self.n + len(record.landmarks)
@@ -356,7 +356,7 @@ class Expected:
         self.M = (whole @ self.M + gamma * self.variance) * self.decay
         return F[None]
 
-    def correct(self, event: Event, rows: list[int], K: np.ndarray, H: dict[int, np.ndarray], y: np.ndarray) -> None:
+    def correct(self, event: Sighting, rows: list[int], K: np.ndarray, H: dict[int, np.ndarray], y: np.ndarray) -> None:
         i, first = event.robot, self.width * event.robot
         size = np.array([event.measured[0], 1.0])
         columns = first + np.array([[4, 5, 8 + event.subject], [6, 7, 8 + self.subjects + event.subject]])
@@ -387,11 +387,11 @@ class Moment(NamedTuple):
 
 
 def filtered(
-    course: Course,
+    course: RobotPath,
     estimator: str,
     assumed: Assumed,
     heard: np.ndarray,
-    carried: Followed | Expected,
+    carried: Followed | RobotMoments,
     last: int | None = None,
 ) -> Iterator[Moment]:
     """Run one estimator, step by step.
@@ -406,7 +406,7 @@ def filtered(
     last : step to end with; default: all.
     """
     record, n, T = course.record, len(course.record.robots), course.record.interval
-    claims = Claims(estimator, len(heard), n)
+    claims = RobotCovariances(estimator, len(heard), n)
     everyone = list(range(n))
     for step in range(record.steps if last is None else last + 1):
         if step:

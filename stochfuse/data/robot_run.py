@@ -23,13 +23,13 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from stochfuse.data.consistency import Average, Series
-from stochfuse.data.robot_errors import Noises, identify
+from stochfuse.data.robot_errors import ChannelNoises, identify
 from stochfuse.data.robot_filters import (
     ESTIMATORS,
     Assumed,
-    Course,
-    Expected,
     Followed,
+    RobotMoments,
+    RobotPath,
     assumed,
     course,
     filtered,
@@ -92,7 +92,7 @@ class RobotRun(Result):
     """
 
     record: RobotRecord
-    noises: Noises
+    noises: ChannelNoises
     until: float
     runs: int
     white: bool
@@ -114,7 +114,7 @@ def run_robots(
     seed: int = 1,
     landmarks: int | None = None,
     until: float = UNTIL,
-    noises: Noises | Literal["identified", "white"] = "identified",
+    noises: ChannelNoises | Literal["identified", "white"] = "identified",
 ) -> RobotRun:
     """Run estimators on a record of robots.
 
@@ -153,8 +153,8 @@ def run_robots(
     alone = _alone(course_, noises, told, last)
     if not white:
         told = told.scaled(alone.factor)
-    items = _Items.drawn(link, runs, course_.pairs, seed)
-    others = _Items.drawn(link, runs, course_.pairs, seed, other=True)
+    items = _ArrivalDraws.drawn(link, runs, course_.pairs, seed)
+    others = _ArrivalDraws.drawn(link, runs, course_.pairs, seed, other=True)
     rows: list[RobotRow] = []
     for k, name in enumerate(estimators):
         listener().advance(name, 2 * k, 2 * len(estimators))
@@ -185,7 +185,7 @@ def _check(record: RobotRecord, link: Sequence[float], estimators: Sequence[str]
         raise UsageError(f"expected probabilities from 0 to 1 and 1 run or more, got {list(link)} and {runs}")
 
 
-class _Items(NamedTuple):
+class _ArrivalDraws(NamedTuple):
     """Draws of arrivals: heard (items, pairs, 2), and the items of each link."""
 
     heard: np.ndarray
@@ -193,7 +193,7 @@ class _Items(NamedTuple):
     of: tuple[slice, ...]
 
     @classmethod
-    def drawn(cls, link: Sequence[float], runs: int, pairs: int, seed: int, other: bool = False) -> _Items:
+    def drawn(cls, link: Sequence[float], runs: int, pairs: int, seed: int, other: bool = False) -> _ArrivalDraws:
         """Draw; one item is enough where nothing is left to chance.  The same numbers for all links."""
         u = np.random.default_rng([seed, int(other)]).random((runs, pairs, 2))
         parts = [u[: 1 if value in (0.0, 1.0) else runs] < value for value in link]
@@ -209,12 +209,12 @@ class _Alone(NamedTuple):
     factor: np.ndarray
 
 
-def _alone(course_: Course, noises: Noises, told: Assumed, last: int) -> _Alone:
+def _alone(course_: RobotPath, noises: ChannelNoises, told: Assumed, last: int) -> _Alone:
     """Every robot by itself: the path that it believes in, and by what its claim is to be scaled."""
     record, nobody = course_.record, np.zeros((1, course_.pairs, 2), dtype=bool)
     followed = Followed(course_, 1)
     path = np.array([followed.x[0].copy() for _ in filtered(course_, "stand-alone", told, nobody, followed)])
-    expected = Expected(course_, noises, path, 1)
+    expected = RobotMoments(course_, noises, path, 1)
     first, n = min(record.step_at(FORGOTTEN), last // 2), len(record.robots)
     deviation, ratio = np.zeros_like(path), np.zeros((record.steps, n))
     for moment in filtered(course_, "stand-alone", told, nobody, expected):
@@ -234,7 +234,7 @@ class _Found(NamedTuple):
     nees: np.ndarray
 
 
-def _realised(course_: Course, name: str, told: Assumed, items: _Items, last: int) -> _Found:
+def _realised(course_: RobotPath, name: str, told: Assumed, items: _ArrivalDraws, last: int) -> _Found:
     followed, found = Followed(course_, len(items.heard)), []
     for moment in filtered(course_, name, told, items.heard, followed):
         if moment.step <= last:
@@ -247,9 +247,15 @@ def _realised(course_: Course, name: str, told: Assumed, items: _Items, last: in
 
 
 def _expected(
-    course_: Course, name: str, told: Assumed, noises: Noises, path: np.ndarray, items: _Items, last: int
+    course_: RobotPath,
+    name: str,
+    told: Assumed,
+    noises: ChannelNoises,
+    path: np.ndarray,
+    items: _ArrivalDraws,
+    last: int,
 ) -> _Found:
-    expected, found = Expected(course_, noises, path, len(items.heard)), []
+    expected, found = RobotMoments(course_, noises, path, len(items.heard)), []
     for moment in filtered(course_, name, told, items.heard, expected):
         if moment.step <= last:
             continue
@@ -259,7 +265,7 @@ def _expected(
     return _Found(*map(np.array, zip(*found, strict=True)))
 
 
-def _rows(name: str, record: RobotRecord, real: _Found, expected: _Found, items: _Items) -> list[RobotRow]:
+def _rows(name: str, record: RobotRecord, real: _Found, expected: _Found, items: _ArrivalDraws) -> list[RobotRow]:
     n, stride, rows = len(record.robots), max(1, round(EVERY / record.interval)), []
     for link, which in zip(items.link, items.of, strict=True):
         series = Series(len(real.nees[::stride]), n, np.full(n, 3.0))

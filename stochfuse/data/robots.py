@@ -28,20 +28,26 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stochfuse.data.columns import WHOLE, Columns, Field, read_columns
+from stochfuse.data.columns import WHOLE, ColumnField, Columns, read_columns
 from stochfuse.errors import UsageError
 
 FILES = {
-    "odometry": (Field("time"), Field("robot", WHOLE), Field("speed"), Field("turn_rate")),
+    "odometry": (ColumnField("time"), ColumnField("robot", WHOLE), ColumnField("speed"), ColumnField("turn_rate")),
     "sightings": (
-        Field("time"),
-        Field("robot", WHOLE),
-        Field("subject", WHOLE),
-        Field("range", least=0.0),
-        Field("bearing"),
+        ColumnField("time"),
+        ColumnField("robot", WHOLE),
+        ColumnField("subject", WHOLE),
+        ColumnField("range", least=0.0),
+        ColumnField("bearing"),
     ),
-    "truth": (Field("time"), Field("robot", WHOLE), Field("x"), Field("y"), Field("heading")),
-    "landmarks": (Field("landmark", WHOLE), Field("x"), Field("y")),
+    "truth": (
+        ColumnField("time"),
+        ColumnField("robot", WHOLE),
+        ColumnField("x"),
+        ColumnField("y"),
+        ColumnField("heading"),
+    ),
+    "landmarks": (ColumnField("landmark", WHOLE), ColumnField("x"), ColumnField("y")),
 }
 """The tables of a folder, and their columns."""
 JITTER = 0.01
@@ -191,7 +197,7 @@ def read_robots(folder: str | Path) -> RobotRecord:
     return record
 
 
-def _table(path: Path, fields: tuple[Field, ...]) -> Columns:
+def _table(path: Path, fields: tuple[ColumnField, ...]) -> Columns:
     if not path.is_file():
         raise UsageError(f"{path}: expected a table with columns {', '.join(f.name for f in fields)}, found no file")
     found = read_columns(str(path), fields)

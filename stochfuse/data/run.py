@@ -22,7 +22,7 @@ import numpy as np
 
 from stochfuse.data.consistency import Average, Series, band
 from stochfuse.data.draw import drawn_arrivals
-from stochfuse.data.records import Batch, read_records
+from stochfuse.data.records import RecordedRuns, read_records
 from stochfuse.data.suspicions import Suspicion, suspicions
 from stochfuse.engines.progress import listener
 from stochfuse.engines.replay import ArrivalRecord, Stage, moments_given, replay
@@ -78,7 +78,7 @@ class RecordsLike(Protocol):
         """What should be known of them."""
         ...
 
-    def batches(self) -> Iterator[Batch]:
+    def batches(self) -> Iterator[RecordedRuns]:
         """Go through the runs, some at a time."""
         ...
 
@@ -369,7 +369,7 @@ def _heard(arrivals: ArrivalRecord) -> np.ndarray:
 
 
 def stages(
-    records: RecordsLike, batch: Batch, arrivals: ArrivalRecord, estimator: str, criterion: str
+    records: RecordsLike, batch: RecordedRuns, arrivals: ArrivalRecord, estimator: str, criterion: str
 ) -> Iterator[Stage]:
     """Follow an estimator through a batch of records; extended where sensors are by name."""
     scenario = records.scenario
@@ -402,7 +402,7 @@ class Tally:
 
     def add(
         self,
-        batch: Batch,
+        batch: RecordedRuns,
         arrivals: ArrivalRecord,
         write: Callable[[Estimates], None] | None = None,
         work: tuple[int, int] = (0, 1),

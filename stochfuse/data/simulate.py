@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from stochfuse.data.draw import drawn, drawn_arrivals
-from stochfuse.data.records import NUMBERS, Batch
+from stochfuse.data.records import NUMBERS, RecordedRuns
 from stochfuse.data.run import RunResult, asked_links, run_records, way_of
 from stochfuse.data.writing import ARRIVALS, ESTIMATES, FIRST, MEASUREMENTS, TRUTH, EstimatesFile, RecordFiles
 from stochfuse.errors import UsageError
@@ -73,7 +73,7 @@ class Draws:
             return ()
         return (f"the truth follows the model; the nominal path departs from it by up to {off:.3g} in a step",)
 
-    def batches(self) -> Iterator[Batch]:
+    def batches(self) -> Iterator[RecordedRuns]:
         """Draw some runs at a time."""
         system, runs = self.scenario.system, len(self.names)
         size = max(1, NUMBERS // (system.agents * system.steps))
@@ -83,7 +83,7 @@ class Draws:
             count = min(size, runs - first)
             found = drawn(system, self.scenario.instruments, start, count, self.seed, first)
             arrivals = drawn_arrivals(system, self.links, found.missed, self.seed, first)
-            batch = Batch(
+            batch = RecordedRuns(
                 np.arange(first, first + count),
                 tuple(np.nan_to_num(z) for z in found.z),
                 found.relations,

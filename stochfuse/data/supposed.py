@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.engines.events import Event, events
+from stochfuse.engines.events import ChanceEvent, events
 from stochfuse.engines.monte_carlo import Experiment, sample
 from stochfuse.errors import UsageError
 from stochfuse.estimators.ledger import InformationClaims, Ledger, Sources, evaluate
@@ -141,7 +141,7 @@ class Simulator:
         return (*self.system.same_structure(), links, self.estimator, self.criterion, self.habits)
 
 
-class _Numbers(NamedTuple):
+class _EstimateNumbers(NamedTuple):
     numbers: np.ndarray
 
 
@@ -222,7 +222,7 @@ class _AsItWas(Ledger):
 
 
 @dataclass(frozen=True, eq=False)
-class _Histories:
+class _RunArrivals:
     """What arrived in every run: which value each agent then has, and the estimator that wrote the values down."""
 
     claims: Callable[[System, System | None], Claims]
@@ -251,7 +251,7 @@ class Sampler:
     runs: int
     seed: int = 1
     errors: bool = False
-    _known: dict[Hashable, _Histories] = field(default_factory=dict)
+    _known: dict[Hashable, _RunArrivals] = field(default_factory=dict)
 
     def shown(self, simulator: Simulator, blocks: Sequence[LinkMeans]) -> list[np.ndarray]:
         """Return what a simulator shows in every run, (runs, cells), for each block; not-a-number where nobody knows.
@@ -265,16 +265,16 @@ class Sampler:
         if simulator.metric is not None and claims <= {simulator.metric.name}:
             raise UsageError(f"metric: expected another than {simulator.metric.name}, which is what is shown")
         histories = self._histories(simulator)
-        look = _Look(simulator, histories, self.errors)
+        look = _EstimateTests(simulator, histories, self.errors)
         return [np.stack([look.at(cell, block.row) for cell in block.cells], axis=1) for block in blocks]
 
-    def _histories(self, simulator: Simulator) -> _Histories:
+    def _histories(self, simulator: Simulator) -> _RunArrivals:
         key = simulator.structure()
         if key not in self._known:
             self._known[key] = self._drawn(simulator)
         return self._known[key]
 
-    def _drawn(self, simulator: Simulator) -> _Histories:
+    def _drawn(self, simulator: Simulator) -> _RunArrivals:
         system, rows, habits = simulator.system, simulator.rows, simulator.habits
         capabilities.require(system, rows, simulator.estimator, MONTE_CARLO)
         estimator, claims = _made(simulator, self.errors)
@@ -285,12 +285,12 @@ class Sampler:
             events=[_events(system, rows, step, habits) for step in range(1, system.steps + 1)],
             detections=[system.detections(step) for step in range(1, system.steps + 1)],
             make=lambda: (estimator, _Unseen),  # pyright: ignore[reportArgumentType]  they number what they claim
-            of=_Numbers,  # pyright: ignore[reportArgumentType]  the values claimed, no estimates of them
+            of=_EstimateNumbers,  # pyright: ignore[reportArgumentType]  the values claimed, no estimates of them
             runs=self.runs,
             seed=self.seed,
         )
         drawn = sample(experiment, len(rows.link))
-        return _Histories(claims, drawn.values.numbers[drawn.which])
+        return _RunArrivals(claims, drawn.values.numbers[drawn.which])
 
 
 def _made(simulator: Simulator, errors: bool) -> tuple[Any, Callable[[System, System | None], Claims]]:
@@ -316,14 +316,14 @@ def _believed(true: System, told: System | None, errors: bool) -> Sources:
     return Sources(replace(believed.model, Bu=real.model.Bu), believed.sensors, starts, real.records)
 
 
-def _events(system: System, rows: LinkRows, step: int, habits: frozenset[str]) -> list[Event]:
+def _events(system: System, rows: LinkRows, step: int, habits: frozenset[str]) -> list[ChanceEvent]:
     network, n = system.network, system.agents
     found = events(network, rows, step)
     if BOTH_WAYS in habits:
         found = [event for event in found if event.receivers[0] < event.sender]
     if OWN_LOST in habits and n > 1:
         µ = rows.matrices(network, step).mean(axis=2)
-        found += [Event(n + i, (i,), µ[:, i]) for i in range(n)]
+        found += [ChanceEvent(n + i, (i,), µ[:, i]) for i in range(n)]
     return found
 
 
@@ -392,10 +392,10 @@ class _Reading:
         return np.asarray(m.bias)[..., states[0], 0]
 
 
-class _Look:
+class _EstimateTests:
     """What can be seen of the estimates of a simulator, worked out once for every different estimate."""
 
-    def __init__(self, simulator: Simulator, histories: _Histories, errors: bool) -> None:
+    def __init__(self, simulator: Simulator, histories: _RunArrivals, errors: bool) -> None:
         self.simulator, self.histories, self.reading = simulator, histories, _Reading(simulator)
         self.of = moments if errors else claimed_only
         self.claims = histories.claims(simulator.system, simulator.told)

@@ -27,8 +27,8 @@ import numpy as np
 from scipy.special import chdtri, ndtri
 
 from stochfuse.data.consistency import Series
-from stochfuse.data.innovations import Innovations, Setting, Supposition, estimates, innovations, setting_of
-from stochfuse.data.records import Batch
+from stochfuse.data.innovations import Innovations, InnovationSetting, Supposition, estimates, innovations, setting_of
+from stochfuse.data.records import RecordedRuns
 from stochfuse.scenario.scenario import Scenario
 from stochfuse.scenario.sensing import Instrument, parts_of
 from stochfuse.scenario.system import System
@@ -101,7 +101,7 @@ AFFINE = (
 """Measurements in other units or of another sense."""
 
 
-class Tried(NamedTuple):
+class FittedCase(NamedTuple):
     """A case, what it is called, and how many numbers were fitted for it."""
 
     name: str
@@ -111,7 +111,7 @@ class Tried(NamedTuple):
     fitted: int = 0
 
 
-def suspicions(scenario: Scenario, batch: Batch, known: np.ndarray) -> tuple[Suspicion, ...]:
+def suspicions(scenario: Scenario, batch: RecordedRuns, known: np.ndarray) -> tuple[Suspicion, ...]:
     """Say what would explain innovations, or errors, that are not what they should be.
 
     Parameters
@@ -137,7 +137,7 @@ def suspicions(scenario: Scenario, batch: Batch, known: np.ndarray) -> tuple[Sus
     )
     setting = setting_of(system, functions, [x[:runs] for x in batch.first])
     ones = tuple(np.ones(each.shape[-1]) for each in z)
-    trial = _Trial(scenario, setting, Supposition(z, ones, ones))
+    trial = _CaseSuspicions(scenario, setting, Supposition(z, ones, ones))
     if _wrong(trial.now):
         return _explained(trial)
     if batch.truth is not None:
@@ -145,7 +145,7 @@ def suspicions(scenario: Scenario, batch: Batch, known: np.ndarray) -> tuple[Sus
     return ()
 
 
-def _explained(trial: _Trial) -> tuple[Suspicion, ...]:
+def _explained(trial: _CaseSuspicions) -> tuple[Suspicion, ...]:
     """What explains it, one after the other; a noise that swallows everything only alone, and if nothing else does."""
     found, value = _path(trial, ())
     if any(each.suspicion in SWALLOW for each in found):
@@ -154,7 +154,7 @@ def _explained(trial: _Trial) -> tuple[Suspicion, ...]:
     return tuple(found) or (_unknown(trial),)
 
 
-def _path(trial: _Trial, without: Sequence[str]) -> tuple[list[Suspicion], float]:
+def _path(trial: _CaseSuspicions, without: Sequence[str]) -> tuple[list[Suspicion], float]:
     """Suspicions, each the likeliest after those before, and the likelihood in the end; none if that is not right."""
     found, cost = [], 0.0
     for _ in range(ROUNDS):
@@ -175,14 +175,14 @@ def _path(trial: _Trial, without: Sequence[str]) -> tuple[list[Suspicion], float
     return found, float(trial.now.likelihood[0]) - cost
 
 
-def _part(batch: Batch, system: System) -> tuple[int, int]:
+def _part(batch: RecordedRuns, system: System) -> tuple[int, int]:
     """How many runs and steps are looked at."""
     n = system.agents
     steps = min(system.steps, STEPS, max(20, MEASURED // n))
     return min(len(batch.runs), RUNS, max(1, MEASURED // (steps * n))), steps
 
 
-def _measured(system: System, batch: Batch, agent: int, f: object) -> np.ndarray:
+def _measured(system: System, batch: RecordedRuns, agent: int, f: object) -> np.ndarray:
     """Whether an agent measured something, (runs, steps)."""
     there = ~batch.missed[:, :, agent]
     H = system.sensors[system.sensor_of[agent]].H
@@ -191,7 +191,7 @@ def _measured(system: System, batch: Batch, agent: int, f: object) -> np.ndarray
     return there & looked
 
 
-def _unknown(trial: _Trial) -> Suspicion:
+def _unknown(trial: _CaseSuspicions) -> Suspicion:
     """Nothing explains it; the worst is the agent without which the others agree best."""
     setting, case, now = trial.setting, trial.case, trial.now
     said = f"nothing tried explains the innovations (NIS {now.nis():.3g}, expected 1)"
@@ -231,7 +231,9 @@ def _wrong(now: Innovations, case: int = 0) -> bool:
     return False
 
 
-def _best(trial: _Trial, *, alone: bool = False, without: Sequence[str] = ()) -> tuple[Tried, Innovations] | None:
+def _best(
+    trial: _CaseSuspicions, *, alone: bool = False, without: Sequence[str] = ()
+) -> tuple[FittedCase, Innovations] | None:
     """What explains most, if anything does; of one agent only; without those of some names."""
     tried = list(trial.cases())
     first = innovations(trial.setting, [trial.case, *(each.case for each in tried)])
@@ -252,7 +254,7 @@ def _best(trial: _Trial, *, alone: bool = False, without: Sequence[str] = ()) ->
     return best
 
 
-def _of_truth(trial: _Trial, truth: np.ndarray, known: np.ndarray) -> list[Suspicion]:
+def _of_truth(trial: _CaseSuspicions, truth: np.ndarray, known: np.ndarray) -> list[Suspicion]:
     """What may be wrong with a record, or with the truth, that innovations alone do not tell."""
     truth = truth[:, :, : 1 if trial.setting.together else None]
     now = _errors(trial.setting, trial.case, truth, known)
@@ -284,7 +286,7 @@ def _of_truth(trial: _Trial, truth: np.ndarray, known: np.ndarray) -> list[Suspi
     return [_untrue("NEES", now.mean)] if now.mean > VERY_FAR else []
 
 
-def _about_truth(trial: _Trial, about: _Trial, truth: np.ndarray) -> list[Suspicion]:
+def _about_truth(trial: _CaseSuspicions, about: _CaseSuspicions, truth: np.ndarray) -> list[Suspicion]:
     """What explains measurements that are not what the true states would show."""
     choices, now = [], about.now
     if len(trial.all) > 1:
@@ -294,7 +296,7 @@ def _about_truth(trial: _Trial, about: _Trial, truth: np.ndarray) -> list[Suspic
             choices.append((after.likelihood[0] - 0.5 * tried.fitted * np.log(truth.size), tried, after))
     for name, said, other in _truths(truth):
         gain, after = _gain(trial, about, other)
-        choices.append((now.likelihood[0] + gain, Tried(name, None, f"the truth: {said}", trial.case), after))
+        choices.append((now.likelihood[0] + gain, FittedCase(name, None, f"the truth: {said}", trial.case), after))
     value, tried, after = max(choices, key=lambda each: each[0])
     if value < now.likelihood[0] + MARGIN or abs(np.log(after.nis())) > abs(np.log(now.nis())):
         return [_untrue("squared deviations", now.nis())] if now.nis() > VERY_FAR else []
@@ -303,7 +305,7 @@ def _about_truth(trial: _Trial, about: _Trial, truth: np.ndarray) -> list[Suspic
     return [Suspicion(tried.name, tried.agent, tried.text + how, explains)]
 
 
-def _gain(trial: _Trial, about: _Trial, truth: np.ndarray) -> tuple[float, Innovations]:
+def _gain(trial: _CaseSuspicions, about: _CaseSuspicions, truth: np.ndarray) -> tuple[float, Innovations]:
     """By how much another truth makes measurements likelier, for as many of them, and deviations from it."""
     after = innovations(trial.setting._replace(truth=truth), [trial.case])
     now = about.now
@@ -330,14 +332,14 @@ def _untrue(what: str, value: float) -> Suspicion:
     return Suspicion("truth", None, text, explains=False)
 
 
-class _Errors(NamedTuple):
+class _MeanNees(NamedTuple):
     """Mean NEES of a degree of freedom, and whether that is far from 1."""
 
     mean: float
     far: bool
 
 
-def _errors(setting: Setting, case: Supposition, truth: np.ndarray, known: np.ndarray) -> _Errors | None:
+def _errors(setting: InnovationSetting, case: Supposition, truth: np.ndarray, known: np.ndarray) -> _MeanNees | None:
     with np.errstate(all="ignore"):
         x, P = estimates(setting, case)
     P, error = P[..., known, :][..., known], (x - truth[:, 1:])[..., known]
@@ -357,13 +359,15 @@ def _errors(setting: Setting, case: Supposition, truth: np.ndarray, known: np.nd
     number = d * max(1.0, min(average.independent, average.number / HANGING))
     high = float(chdtri(number, CHANCE)) / number
     mean = average.mean / d
-    return _Errors(mean, mean > max(high, FAR))
+    return _MeanNees(mean, mean > max(high, FAR))
 
 
-class _Trial:
+class _CaseSuspicions:
     """Everything that is suspected of a case."""
 
-    def __init__(self, scenario: Scenario, setting: Setting, case: Supposition, now: Innovations | None = None) -> None:
+    def __init__(
+        self, scenario: Scenario, setting: InnovationSetting, case: Supposition, now: Innovations | None = None
+    ) -> None:
         now = innovations(setting, [case]) if now is None else now
         self.scenario, self.setting, self.case, self.now = scenario, setting, case, now
         self.units = [_units(scenario, i) for i in range(len(case.z))]
@@ -374,16 +378,16 @@ class _Trial:
         self.agents = sorted(sorted(seeing, key=lambda i: -off[i])[:AGENTS])
         self.all = seeing
 
-    def about(self, truth: np.ndarray) -> _Trial:
+    def about(self, truth: np.ndarray) -> _CaseSuspicions:
         """Return the same of deviations from what the true states would show."""
         setting = self.setting._replace(truth=truth)
-        return _Trial(self.scenario, setting, self.case)
+        return _CaseSuspicions(self.scenario, setting, self.case)
 
-    def of(self, case: Supposition, now: Innovations) -> _Trial:
+    def of(self, case: Supposition, now: Innovations) -> _CaseSuspicions:
         """Return the same of another case, whose innovations are known."""
-        return _Trial(self.scenario, self.setting, case, now)
+        return _CaseSuspicions(self.scenario, self.setting, case, now)
 
-    def cases(self) -> Iterator[Tried]:
+    def cases(self) -> Iterator[FittedCase]:
         """Those without anything to fit, and those that others are fitted by, which have no name."""
         for who in self._who():
             for affine in AFFINE:
@@ -413,7 +417,7 @@ class _Trial:
         name = f" ({self.names[who[0]]})" if self.names else ""
         return who[0] + 1, "the agent" if alone else f"agent {who[0] + 1}{name}"
 
-    def _affine(self, affine: Affine, who: Sequence[int]) -> Iterator[Tried]:
+    def _affine(self, affine: Affine, who: Sequence[int]) -> Iterator[FittedCase]:
         agent, called = self._called(who)
         choices = [{i: [c for c, unit in enumerate(self.units[i]) if affine.unit in (None, unit)] for i in who}]
         if len(who) == 1 and len(choices[0][who[0]]) > 1:
@@ -427,7 +431,7 @@ class _Trial:
                 z[..., components] = affine.a * z[..., components] + affine.b
                 scale[components] *= affine.a
                 case = case.with_agent(i, z=z, scale=scale)
-            yield Tried(affine.name, agent, f"{called}: {self._components(places)} {affine.text}", case)
+            yield FittedCase(affine.name, agent, f"{called}: {self._components(places)} {affine.text}", case)
 
     def _components(self, places: dict[int, list[int]]) -> str:
         different = {tuple(components) for components in places.values()}
@@ -435,7 +439,7 @@ class _Trial:
             return "measurements"
         return ", ".join(f"z{c + 1}" for c in different.pop())
 
-    def _noises(self, who: Sequence[int]) -> Iterator[Tried]:
+    def _noises(self, who: Sequence[int]) -> Iterator[FittedCase]:
         """R with deviations where variances belong, the other way, or by a factor."""
         agent, called = self._called(who)
         squared, rooted = ([R[i] ** power for i in who] for R, power in ((self.R, 1.0), (self.R, -0.5)))
@@ -444,14 +448,14 @@ class _Trial:
             ("variance-for-deviation", "R has squared variances (sigma given as a variance)", rooted),
         ):
             if max(float(np.abs(np.log(f)).max()) for f in factors) > np.log(FACTOR):
-                yield Tried(name, agent, f"{called}: {said}, which", self._noisier(who, factors))
+                yield FittedCase(name, agent, f"{called}: {said}, which", self._noisier(who, factors))
         for factor in FACTORS[FACTORS != 1.0]:
             yield self._scaled_noise(who, factor)
 
-    def _scaled_noise(self, who: Sequence[int], factor: float) -> Tried:
+    def _scaled_noise(self, who: Sequence[int], factor: float) -> FittedCase:
         agent, called = self._called(who)
         case = self._noisier(who, [np.full(len(self.R[i]), factor) for i in who])
-        return Tried("R-scaled", agent, f"{called}: an R of {factor:.2g} times the scenario's", case, 1)
+        return FittedCase("R-scaled", agent, f"{called}: an R of {factor:.2g} times the scenario's", case, 1)
 
     def _noisier(self, who: Sequence[int], factors: Sequence[np.ndarray]) -> Supposition:
         case = self.case
@@ -459,46 +463,46 @@ class _Trial:
             case = case.with_agent(i, noise=case.noise[i] * factor)
         return case
 
-    def _process(self, factor: float) -> Tried:
+    def _process(self, factor: float) -> FittedCase:
         case = self.case._replace(process=self.case.process * factor)
-        return Tried("Q-scaled", None, f"process noise: a Q of {factor:.2g} times the scenario's", case, 1)
+        return FittedCase("Q-scaled", None, f"process noise: a Q of {factor:.2g} times the scenario's", case, 1)
 
-    def _start(self, factor: float) -> Tried:
+    def _start(self, factor: float) -> FittedCase:
         case = self.case._replace(start=self.case.start * factor)
-        return Tried("P-scaled", None, f"first estimates: a P of {factor:.2g} times the scenario's", case, 1)
+        return FittedCase("P-scaled", None, f"first estimates: a P of {factor:.2g} times the scenario's", case, 1)
 
-    def _shifted(self, agent: int) -> Iterator[Tried]:
+    def _shifted(self, agent: int) -> Iterator[FittedCase]:
         number, called = self._called([agent])
         for by, name, said in ((-1, "late", "late"), (1, "early", "early")):
             z = np.full_like(self.case.z[agent], np.nan)
             kept, put = (slice(1, None), slice(None, -1)) if by < 0 else (slice(None, -1), slice(1, None))
             z[:, put] = self.case.z[agent][:, kept]
             z[:, 0] = np.nan
-            yield Tried(name, number, f"{called}: its clock one step {said}", self.case.with_agent(agent, z=z))
+            yield FittedCase(name, number, f"{called}: its clock one step {said}", self.case.with_agent(agent, z=z))
 
-    def _exchanged(self, agent: int) -> Iterator[Tried]:
+    def _exchanged(self, agent: int) -> Iterator[FittedCase]:
         number, called = self._called([agent])
         for i, j in combinations(range(self.case.z[agent].shape[-1]), 2):
             z = self.case.z[agent].copy()
             z[..., [i, j]] = z[..., [j, i]]
             text = f"{called}: z{i + 1} and z{j + 1} in each other's place"
-            yield Tried("components-swapped", number, text, self.case.with_agent(agent, z=z))
+            yield FittedCase("components-swapped", number, text, self.case.with_agent(agent, z=z))
 
-    def _swapped(self, i: int, j: int) -> Iterator[Tried]:
+    def _swapped(self, i: int, j: int) -> Iterator[FittedCase]:
         system, z = self.setting.system, self.case.z
         if z[i].shape != z[j].shape or (system.one_state and system.labels[i] == system.labels[j]):
             return
         case = self.case.with_agent(i, z=z[j]).with_agent(j, z=z[i])
-        yield Tried("agents-swapped", i + 1, f"agents {i + 1} and {j + 1} in each other's place", case)
+        yield FittedCase("agents-swapped", i + 1, f"agents {i + 1} and {j + 1} in each other's place", case)
 
-    def _probes(self, agent: int) -> Iterator[Tried]:
+    def _probes(self, agent: int) -> Iterator[FittedCase]:
         """Biases of one deviation, from which the likeliest is found: innovations are linear in it."""
         for component, R in enumerate(self.R[agent]):
             z = self.case.z[agent].copy()
             z[..., component] -= np.sqrt(R)
-            yield Tried("", agent, f"{component}", self.case.with_agent(agent, z=z))
+            yield FittedCase("", agent, f"{component}", self.case.with_agent(agent, z=z))
 
-    def fitted(self, tried: Sequence[Tried], found: Innovations) -> Iterator[Tried]:
+    def fitted(self, tried: Sequence[FittedCase], found: Innovations) -> Iterator[FittedCase]:
         """Those that rest on what was found of the first."""
         for agent in self.agents:
             yield from self._biased(agent, tried, found)
@@ -511,7 +515,7 @@ class _Trial:
         for factor in self._between("P-scaled", None, tried, found):
             yield self._start(factor)
 
-    def _biased(self, agent: int, tried: Sequence[Tried], found: Innovations) -> Iterator[Tried]:
+    def _biased(self, agent: int, tried: Sequence[FittedCase], found: Innovations) -> Iterator[FittedCase]:
         places = [i for i, each in enumerate(tried, start=1) if not each.name and each.agent == agent]
         base = found.white[0].ravel()
         slopes = np.stack([found.white[i].ravel() - base for i in places], axis=-1)
@@ -528,9 +532,9 @@ class _Trial:
                 bias[some] = size * np.sqrt(self.R[agent][some])
                 case = self.case.with_agent(agent, z=self.case.z[agent] - bias)
                 said = ", ".join(f"z{c + 1} by {bias[c]:.3g}{_in(self.units[agent][c])}" for c in some)
-                yield Tried("bias", number, f"{called}: a bias of {said}", case, len(some))
+                yield FittedCase("bias", number, f"{called}: a bias of {said}", case, len(some))
 
-    def _between(self, name: str, agent: int | None, tried: Sequence[Tried], found: Innovations) -> list[float]:
+    def _between(self, name: str, agent: int | None, tried: Sequence[FittedCase], found: Innovations) -> list[float]:
         """Factors about the likeliest of those of a name that were tried."""
         which = [i for i, each in enumerate(tried, start=1) if (each.name, each.agent) == (name, agent)]
         factors = FACTORS[FACTORS != 1.0]

@@ -141,14 +141,14 @@ def _of_bytes(name: str, stream: IO[bytes]) -> OpenedTable:
         alone = len(starts) > 1 and starts[1] == 1
         starts = np.concatenate([[0], starts[2:] - 1] if alone else [[0], starts[1:] - 1])
         firsts = np.concatenate([[firsts[1]], firsts[2:]] if alone else [[firsts[0] + 1], firsts[1:]])
-        yield _csv_part(name, _Block(rest, first.length - 1, starts, firsts), header, separator, kinds)
+        yield _csv_part(name, _LineBlock(rest, first.length - 1, starts, firsts), header, separator, kinds)
         for block in blocks:
             yield _csv_part(name, block, header, separator, kinds)
 
     return OpenedTable(name, "line", header, parts)
 
 
-class _Block(NamedTuple):
+class _LineBlock(NamedTuple):
     """Lines of a file without those that are skipped, and their numbers as in `Columns`."""
 
     text: bytes
@@ -157,7 +157,7 @@ class _Block(NamedTuple):
     firsts: np.ndarray
 
 
-def _blocks(name: str, head: bytes, stream: IO[bytes]) -> Iterator[_Block]:
+def _blocks(name: str, head: bytes, stream: IO[bytes]) -> Iterator[_LineBlock]:
     """Whole lines, each ended by a newline."""
     kept, line, place = b"", 1, 0
     data = head.removeprefix(b"\xef\xbb\xbf")
@@ -186,21 +186,21 @@ def _blocks(name: str, head: bytes, stream: IO[bytes]) -> Iterator[_Block]:
             yield block
 
 
-def _without_comments(text: bytes, line: int, lines: int) -> _Block:
+def _without_comments(text: bytes, line: int, lines: int) -> _LineBlock:
     if not (b"#" in text or b"\n\n" in text or text.startswith(b"\n")):
-        return _Block(text, lines, np.array([0]), np.array([line]))
+        return _LineBlock(text, lines, np.array([0]), np.array([line]))
     split = text.split(b"\n")[:-1]
     kept = [i for i, each in enumerate(split) if each and not each.lstrip(b' \t"').startswith(b"#")]
     numbers = np.array(kept, dtype=np.int64) + line
     starts = np.flatnonzero(np.diff(numbers, prepend=-1) != 1)
-    return _Block(b"".join(split[i] + b"\n" for i in kept), len(kept), starts, numbers[starts])
+    return _LineBlock(b"".join(split[i] + b"\n" for i in kept), len(kept), starts, numbers[starts])
 
 
 def _cells_of(line: bytes, separator: str) -> list[str]:
     return next(csv.reader([line.decode()], delimiter=separator), [])
 
 
-def _csv_part(name: str, block: _Block, header: Sequence[str], separator: str, kinds: Mapping[int, str]) -> Raw:
+def _csv_part(name: str, block: _LineBlock, header: Sequence[str], separator: str, kinds: Mapping[int, str]) -> Raw:
     """Lines that are parsed when the first column is asked for, by when the kinds are settled."""
     lines: list[bytes] = []
     parsed: list[Any] = []
@@ -222,12 +222,12 @@ def _csv_part(name: str, block: _Block, header: Sequence[str], separator: str, k
     return Raw(block.length, column, cell, block.starts, block.firsts)
 
 
-def _line(block: _Block, row: int) -> int:
+def _line(block: _LineBlock, row: int) -> int:
     stretch = int(np.searchsorted(block.starts, row, side="right")) - 1
     return int(block.firsts[stretch] + row - block.starts[stretch])
 
 
-def _check_quotes(name: str, block: _Block) -> None:
+def _check_quotes(name: str, block: _LineBlock) -> None:
     if b'"' not in block.text:
         return
     text = np.frombuffer(block.text, dtype=np.uint8)
@@ -239,7 +239,7 @@ def _check_quotes(name: str, block: _Block) -> None:
         raise ColumnsError(f"{name}, line {_line(block, row)}: expected quotation marks in pairs, got {line!r:.60}")
 
 
-def _by_csv(name: str, block: _Block, header: Sequence[str], separator: str) -> list[tuple[str, ...]]:
+def _by_csv(name: str, block: _LineBlock, header: Sequence[str], separator: str) -> list[tuple[str, ...]]:
     """All columns as texts."""
     rows = list(csv.reader(io.StringIO(block.text.decode(), newline=""), delimiter=separator))
     lengths = np.fromiter(map(len, rows), dtype=np.int64, count=len(rows))

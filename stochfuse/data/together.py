@@ -27,7 +27,7 @@ MOST_TOGETHER = 1500
 """Cells of a link whose correlations are worked out; of more, as many spread over all of them."""
 
 
-class Block(NamedTuple):
+class LinkCells(NamedTuple):
     """Cells of one link, whose runs are the same.
 
     Parameters
@@ -40,14 +40,14 @@ class Block(NamedTuple):
     correlation: np.ndarray
 
 
-def blocks_of(judged: Sequence[Judged]) -> tuple[Block, ...]:
+def blocks_of(judged: Sequence[Judged]) -> tuple[LinkCells, ...]:
     """Cells of every link and how they hang together."""
     found = []
     for row in sorted({j.cell.row for j in judged if j.runs is not None}):
         cells = [i for i, j in enumerate(judged) if j.cell.row == row]
         if len(cells) > MOST_TOGETHER:
             cells = [cells[i] for i in np.unique(np.linspace(0, len(cells) - 1, MOST_TOGETHER).astype(int))]
-        found.append(Block(tuple(cells), _correlation([judged[i] for i in cells])))
+        found.append(LinkCells(tuple(cells), _correlation([judged[i] for i in cells])))
     return tuple(found)
 
 
@@ -75,7 +75,7 @@ def _correlation(judged: Sequence[Judged]) -> np.ndarray:
     return correlation
 
 
-def together(judged: Sequence[Judged], blocks: Sequence[Block]) -> float | None:
+def together(judged: Sequence[Judged], blocks: Sequence[LinkCells]) -> float | None:
     """Hotelling's T² of every link's cells, then over links; None if there are too few runs for it."""
     by_link = []
     for block in blocks:
@@ -102,7 +102,7 @@ def together(judged: Sequence[Judged], blocks: Sequence[Block]) -> float | None:
     return float(chdtrc(2 * len(by_link), -2.0 * float(np.log(np.maximum(by_link, 1e-300)).sum())))
 
 
-def _drawn_alike(judged: Sequence[Judged], blocks: Sequence[Block]) -> bool:
+def _drawn_alike(judged: Sequence[Judged], blocks: Sequence[LinkCells]) -> bool:
     """Whether runs of one number are drawn alike for several links, by one seed for all: links that tell the same."""
     found = []
     for block in blocks:

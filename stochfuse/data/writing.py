@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse.data.records import Batch
+from stochfuse.data.records import RecordedRuns
 from stochfuse.data.run import Estimates
 from stochfuse.data.tables import SUFFIXES
 from stochfuse.engines.replay import ArrivalRecord
@@ -169,7 +169,7 @@ class RecordFiles:
     def __exit__(self, *error: Any) -> None:
         self._stack.__exit__(*error)
 
-    def write(self, batch: Batch, names: Sequence[str], seen: Callable[[int], np.ndarray]) -> None:
+    def write(self, batch: RecordedRuns, names: Sequence[str], seen: Callable[[int], np.ndarray]) -> None:
         """Write some runs.
 
         Parameters
@@ -192,7 +192,7 @@ class RecordFiles:
             first = np.stack(batch.first, axis=1).reshape(-1, d)
             self.first.add([np.repeat(runs, n), np.tile(self._agents, count), *first.T])
 
-    def _write_measurements(self, batch: Batch, runs: np.ndarray, seen: Callable[[int], np.ndarray]) -> None:
+    def _write_measurements(self, batch: RecordedRuns, runs: np.ndarray, seen: Callable[[int], np.ndarray]) -> None:
         parts = []
         for agent, z in enumerate(batch.z):
             run, step = np.nonzero(seen(agent))

@@ -64,7 +64,7 @@ from stochfuse.errors import UsageError
 from stochfuse.kalman.kernel import (
     AsTheyAre,
     Estimate,
-    Numbers,
+    SquareRootNumbers,
     at_step,
     from_factor,
     posterior_gain,
@@ -393,7 +393,7 @@ class LosslessFilter(NamedTuple):
     P0: np.ndarray
     shared: bool
     error: np.ndarray | None = None
-    numbers: Numbers = AsTheyAre()
+    numbers: SquareRootNumbers = AsTheyAre()
     first: Mapping[tuple[int, ...], np.ndarray] | None = None
 
     def begins(self, counts: np.ndarray) -> list[int]:

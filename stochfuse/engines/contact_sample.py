@@ -32,7 +32,7 @@ import numpy as np
 from stochfuse.engines.contact_chain import AlongPath, LosslessFilter
 from stochfuse.engines.events import events
 from stochfuse.engines.monte_carlo import (
-    Block,
+    RunBlock,
     arrivals,
     blocks_of,
     fates_by_step,
@@ -44,7 +44,7 @@ from stochfuse.engines.monte_carlo import (
 )
 from stochfuse.engines.precision import suspects
 from stochfuse.engines.progress import listener
-from stochfuse.estimators.protocol import Arrivals
+from stochfuse.estimators.protocol import StepOutcomes
 from stochfuse.kalman.kernel import Estimate, from_factor, taken_in
 from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.system import Noises, System
@@ -115,8 +115,8 @@ def sample_optimum(
     heard = np.empty((rows, runs, K, n), np.uint16)
     size = max(1, most_bytes // _bytes_of_a_run(system))
     blocks = blocks_of(runs, n, rows, first)
-    outcomes = _Outcomes(system, links, seed)
-    work = _Work(outcomes, _Riccati(system), system, size)
+    outcomes = _ContactOutcomes(system, links, seed)
+    work = _ContactWork(outcomes, _Riccati(system), system, size)
     if workers is None:
         workers = len(os.sched_getaffinity(0)) if rows * runs * sum(map(len, outcomes.events)) >= MANY else 1
     for done, (row, start, now, left, number) in enumerate(
@@ -130,15 +130,15 @@ def sample_optimum(
     return OptimumSample(P, bias, heard)
 
 
-class _Work(NamedTuple):
+class _ContactWork(NamedTuple):
     """What a process needs to follow blocks of runs, so many runs at a time."""
 
-    outcomes: _Outcomes
+    outcomes: _ContactOutcomes
     riccati: _Riccati
     system: System
     size: int
 
-    def follow(self, block: Block) -> tuple[int, int, np.ndarray, np.ndarray | None, np.ndarray]:
+    def follow(self, block: RunBlock) -> tuple[int, int, np.ndarray, np.ndarray | None, np.ndarray]:
         """Row and first run of a block, covariances (runs, steps, agents, d, d), biases (…, d, 1), numbers heard."""
         runs, system = block.size, self.system
         P = np.empty((runs, system.steps, system.agents, system.dimension, system.dimension))
@@ -155,7 +155,7 @@ class _Work(NamedTuple):
         return block.row, block.first, P, bias, heard
 
 
-def _all_followed(work: _Work, blocks: Sequence[Block], workers: int) -> Iterator[Any]:
+def _all_followed(work: _ContactWork, blocks: Sequence[RunBlock], workers: int) -> Iterator[Any]:
     """Every block followed, in order: by processes that share them, or here."""
     if workers == 1:
         yield from map(work.follow, blocks)
@@ -164,16 +164,16 @@ def _all_followed(work: _Work, blocks: Sequence[Block], workers: int) -> Iterato
         yield from pool.map(_follow, blocks)
 
 
-_shared: list[_Work] = []
+_shared: list[_ContactWork] = []
 """What a process that follows blocks was started with: too large to be sent with every block."""
 
 
-def _begin(work: _Work) -> None:
+def _begin(work: _ContactWork) -> None:
     quietly()
     _shared[:] = [work]
 
 
-def _follow(block: Block) -> Any:
+def _follow(block: RunBlock) -> Any:
     return _shared[0].follow(block)
 
 
@@ -186,7 +186,7 @@ def _bytes_of_a_run(system: System) -> int:
 # what becomes of messages and measurements
 
 
-class _Outcomes:
+class _ContactOutcomes:
     """What outcomes are drawn from: those of `monte_carlo`, the same as of any other estimator."""
 
     def __init__(self, system: System, links: LinkRows, seed: int) -> None:
@@ -197,7 +197,7 @@ class _Outcomes:
         self.detections = [system.detections(step) for step in steps]
         self.links = links_of(self.events, system.agents)
 
-    def of(self, block: Block) -> list[Arrivals]:
+    def of(self, block: RunBlock) -> list[StepOutcomes]:
         """What becomes of every step in the runs of a block."""
         random, size = stream(self.seed, block.row, block.number), (block.size, self.agents)
         drawn = fates_by_step(random, self.events, self.detections, size, block.row)
@@ -208,7 +208,7 @@ class _Outcomes:
 
 
 def _followed(
-    riccati: _Riccati, steps: Iterator[Arrivals], runs: int, agents: int
+    riccati: _Riccati, steps: Iterator[StepOutcomes], runs: int, agents: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray | None, np.ndarray]]:
     """Covariance (runs, agents, d, d), bias (runs, agents, d, 1) and number heard (runs, agents) after every step.
 

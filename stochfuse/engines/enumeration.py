@@ -29,7 +29,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from stochfuse.engines.events import Event, Outcome, Rows, Weights, concerning, number_of_outcomes, outcomes
+from stochfuse.engines.events import ChanceEvent, Outcome, Rows, Weights, concerning, number_of_outcomes, outcomes
 from stochfuse.engines.progress import listener, uncollected
 from stochfuse.errors import TooManyError
 from stochfuse.estimators.protocol import AdditiveEstimator, Estimator
@@ -105,7 +105,7 @@ class Request:
 
     agents: int
     steps: int
-    events: Callable[[int], list[Event]]
+    events: Callable[[int], list[ChanceEvent]]
     weights: Weights
     groups: tuple[tuple[int, ...], ...]
     most: int = 100_000
@@ -279,7 +279,7 @@ def _check_ending(states: int, events: int) -> None:
 def _ending(
     estimator: Estimator,
     layer: dict[Any, Any],
-    last: list[Event],
+    last: list[ChanceEvent],
     degree: int,
     events: int,
     step: int,
@@ -306,8 +306,8 @@ def _ending(
 def _two_step_ending(
     estimator: AdditiveEstimator,
     layer: dict[Any, Any],
-    before: list[Event],
-    last: list[Event],
+    before: list[ChanceEvent],
+    last: list[ChanceEvent],
     degree: int,
     events: int,
     step: int,
@@ -349,7 +349,7 @@ def _members(agents: int, n: int) -> list[int]:
     return [i for i in range(n) if agents >> i & 1]
 
 
-def _last_heard(last: list[Event], request: Request) -> dict[int, list[Any]]:
+def _last_heard(last: list[ChanceEvent], request: Request) -> dict[int, list[Any]]:
     """What an agent can fuse in the last exchange, with the weight for every group of agents."""
     found: dict[int, list[Any]] = {}
     weights = request.weights
@@ -365,7 +365,7 @@ def _last_heard(last: list[Event], request: Request) -> dict[int, list[Any]]:
 
 
 def _cells(
-    drawn: list[Event], members: Sequence[int], weights: Weights
+    drawn: list[ChanceEvent], members: Sequence[int], weights: Weights
 ) -> tuple[dict[int, np.ndarray], np.ndarray, np.ndarray]:
     """All outcomes of some events: what each member hears, the factor's number, and the factors."""
     cells = np.arange(1 << len(drawn))

@@ -29,14 +29,14 @@ from stochfuse.scenario.network import LinkRows, Network, possible_senders, reac
 from stochfuse.scenario.system import Detection
 
 if TYPE_CHECKING:
-    from stochfuse.engines.events import Event, Fate
+    from stochfuse.engines.events import ChanceEvent, Fate
 
 
 MOST_AGENTS_RELABELLED = 7
 """Agents up to which relabellings are looked for: their number grows with the factorial."""
 
 
-class Event(NamedTuple):
+class ChanceEvent(NamedTuple):
     """One draw of a step: who sends, who hears it, with which probability in each row, and after which delay.
 
     Of a bursty link `probability` is the mean; `burst` (rows, 4) says how it comes about, and `number` which link it is
@@ -76,7 +76,7 @@ class Outcome(NamedTuple):
     missed: int = 0
 
 
-def events(network: Network, rows: LinkRows, step: int) -> list[Event]:
+def events(network: Network, rows: LinkRows, step: int) -> list[ChanceEvent]:
     """Events of a step, those that are impossible in every row left out where links differ."""
     n, senders = network.agents, possible_senders(network.architecture, network.agents)
     µ = rows.matrices(network, step)
@@ -86,7 +86,7 @@ def events(network: Network, rows: LinkRows, step: int) -> list[Event]:
         drawn = [(j, heard, µ[:, heard[0], place[heard[0], j]]) for j, heard in listeners.items() if heard]
     else:
         drawn = [(int(j), (i,), µ[:, i, p]) for i in range(n) for p, j in enumerate(senders[i])]
-    found = [Event(j, heard, p, delay=network.delay_of(heard[0], j)) for j, heard, p in drawn]
+    found = [ChanceEvent(j, heard, p, delay=network.delay_of(heard[0], j)) for j, heard, p in drawn]
     if rows.bursts is not None:
         return [e._replace(burst=rows.chain(e.probability), number=number) for number, e in enumerate(found)]
     # with one µ for all links the answer is a polynomial in µ, whatever values of µ are asked for
@@ -188,7 +188,7 @@ def orbits(n: int, permutations: Sequence[tuple[int, ...]]) -> list[tuple[int, .
 
 
 def outcomes(
-    drawn: Sequence[Event], agents: int, left: int, weights: Weights, detections: Sequence[Detection] = ()
+    drawn: Sequence[ChanceEvent], agents: int, left: int, weights: Weights, detections: Sequence[Detection] = ()
 ) -> list[Outcome]:
     """Every outcome of a step that has a positive probability in some row.
 
@@ -222,23 +222,23 @@ def outcomes(
     return whole
 
 
-def number_of_outcomes(drawn: Sequence[Event], left: int, detections: Sequence[Detection] = ()) -> int:
+def number_of_outcomes(drawn: Sequence[ChanceEvent], left: int, detections: Sequence[Detection] = ()) -> int:
     """How many outcomes a step has, likely or not; parameters as of `outcomes`."""
     return prod(len(fates(event.delay, left)) for event in drawn) << len(detections)
 
 
-def concerning(drawn: Sequence[Event], agents: Sequence[int]) -> list[Event]:
+def concerning(drawn: Sequence[ChanceEvent], agents: Sequence[int]) -> list[ChanceEvent]:
     """Events that concern some agents."""
     return [event for event in drawn if set(event.receivers) & set(agents)]
 
 
-def _heard(heard: tuple[int, ...], event: Event, fate: Fate) -> tuple[int, ...]:
+def _heard(heard: tuple[int, ...], event: ChanceEvent, fate: Fate) -> tuple[int, ...]:
     if fate.delay != 0:
         return heard
     return tuple(h | 1 << event.sender if i in event.receivers else h for i, h in enumerate(heard))
 
 
-def _late(event: Event, fate: Fate) -> tuple[Late, ...]:
+def _late(event: ChanceEvent, fate: Fate) -> tuple[Late, ...]:
     if not fate.delay:
         return ()
     return tuple(Late(receiver, fate.delay, event.sender) for receiver in event.receivers)
@@ -304,7 +304,7 @@ class CountWeights(_Polynomial):
         """Weight of the start."""
         return 1
 
-    def factor(self, event: Event, fate: Fate) -> Any:
+    def factor(self, event: ChanceEvent, fate: Fate) -> Any:
         """Shift of one event's fate."""
         return 0 if fate.delay is None else self.bits
 
@@ -348,7 +348,7 @@ class Coefficients(_Polynomial):
 
     none = one
 
-    def factor(self, event: Event, fate: Fate) -> np.ndarray:
+    def factor(self, event: ChanceEvent, fate: Fate) -> np.ndarray:
         """Coefficients of one event's fate."""
         return np.array([fate.missed, fate.arrived])
 
@@ -381,7 +381,7 @@ class Rows(_Memoryless):
 
     none = one
 
-    def factor(self, event: Event, fate: Fate) -> np.ndarray:
+    def factor(self, event: ChanceEvent, fate: Fate) -> np.ndarray:
         """Probabilities of one event's fate."""
         µ = event.probability
         return fate.missed * (1.0 - µ) + fate.arrived * µ
@@ -440,7 +440,7 @@ class Bursty(Rows):
             total = np.concatenate([total * (1.0 - bad)[:, None], total * bad[:, None]], axis=1)
         return total.ravel()
 
-    def factor(self, event: Event, fate: Fate) -> np.ndarray:
+    def factor(self, event: ChanceEvent, fate: Fate) -> np.ndarray:
         """Probabilities of one event's fate in every hidden state."""
         if event.burst is None:
             raise ValueError("expected an event of a bursty link")
@@ -465,7 +465,7 @@ class Bursty(Rows):
 Weights = CountWeights | Coefficients | Rows
 
 
-def bursty(drawn: Sequence[Event], rows: int) -> Bursty:
+def bursty(drawn: Sequence[ChanceEvent], rows: int) -> Bursty:
     """Return the bookkeeping for bursty links.
 
     Raises

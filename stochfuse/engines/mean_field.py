@@ -25,7 +25,7 @@ from stochfuse.kalman.averaged_update import update_measurement_space, update_sc
 from stochfuse.kalman.kernel import (
     AsTheyAre,
     Information,
-    Numbers,
+    SquareRootNumbers,
     at_step,
     factor,
     from_factor,
@@ -257,7 +257,7 @@ class SquareRoot:
     numbers : what its numbers go through.
     """
 
-    def __init__(self, case: Case, numbers: Numbers = AsTheyAre()):  # noqa: B008
+    def __init__(self, case: Case, numbers: SquareRootNumbers = AsTheyAre()):  # noqa: B008
         self.case, self.numbers = case, numbers
 
     def start(self) -> Carried:

@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.engines.events import Event
+from stochfuse.engines.events import ChanceEvent
 from stochfuse.engines.progress import listener, uncollected
-from stochfuse.estimators.protocol import Arrivals, Claims, Estimator, Exchange, Late, Together
+from stochfuse.estimators.protocol import Claims, Estimator, Exchange, Late, StepOutcomes, Together
 from stochfuse.kalman.kernel import Estimate
 from stochfuse.scenario.system import Detection
 
@@ -52,7 +52,7 @@ class Experiment(NamedTuple):
     """
 
     agents: int
-    events: list[list[Event]]
+    events: list[list[ChanceEvent]]
     detections: list[list[Detection]]
     make: Callable[[], tuple[Estimator, Callable[[], Claims]]]
     of: Callable[[Estimate], Any]
@@ -62,7 +62,7 @@ class Experiment(NamedTuple):
     together: Callable[[int], Together] | None = None
 
 
-class Block(NamedTuple):
+class RunBlock(NamedTuple):
     """Runs drawn from one seed.
 
     Parameters
@@ -138,19 +138,19 @@ def size_of_block(agents: int) -> int:
     return BLOCK if agents <= MOST_OF_BLOCK else max(1, BLOCK * MOST_OF_BLOCK**2 // agents**2)
 
 
-def blocks_of(runs: int, agents: int, rows: int, begin: int = 0) -> list[Block]:
+def blocks_of(runs: int, agents: int, rows: int, begin: int = 0) -> list[RunBlock]:
     """Blocks of so many runs of every row, numbered from some number on."""
     size = size_of_block(agents)
     starts = range(0, runs, size)
     sizes = [min(size, runs - first) for first in starts]
     return [
-        Block(row, number, first, size, range(size))
+        RunBlock(row, number, first, size, range(size))
         for row in range(rows)
         for number, (first, size) in enumerate(zip(starts, sizes, strict=True), start=begin)
     ]
 
 
-def _split(block: Block, pieces: int) -> list[Block]:
+def _split(block: RunBlock, pieces: int) -> list[RunBlock]:
     ends = [block.size * piece // pieces for piece in range(pieces + 1)]
     return [block._replace(runs=range(a, b)) for a, b in pairwise(ends) if a < b]
 
@@ -171,13 +171,13 @@ def quietly() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def run_blocks(experiment: Experiment, blocks: Sequence[Block]) -> tuple[Any, np.ndarray]:
+def run_blocks(experiment: Experiment, blocks: Sequence[RunBlock]) -> tuple[Any, np.ndarray]:
     """What is kept, and its index (runs, steps, agents), for some blocks."""
     with uncollected():
         return (_run_blocks if experiment.together is None else _run_together)(experiment, blocks)
 
 
-def _run_together(experiment: Experiment, blocks: Sequence[Block]) -> tuple[Any, np.ndarray]:
+def _run_together(experiment: Experiment, blocks: Sequence[RunBlock]) -> tuple[Any, np.ndarray]:
     if experiment.together is None:
         raise ValueError("nothing that follows many runs at a time")
     links = links_of(experiment.events, experiment.agents)
@@ -206,21 +206,21 @@ def _run_together(experiment: Experiment, blocks: Sequence[Block]) -> tuple[Any,
     return kept, np.concatenate(found)
 
 
-def arrivals(links: Links, fates: np.ndarray, missed: np.ndarray) -> Arrivals:
+def arrivals(links: StepLinks, fates: np.ndarray, missed: np.ndarray) -> StepOutcomes:
     """What becomes of a step, from fates and misses as they are drawn."""
-    return Arrivals(links.arrived(fates), missed.astype(bool) if missed.any() else None)
+    return StepOutcomes(links.arrived(fates), missed.astype(bool) if missed.any() else None)
 
 
-def of_runs(now: Arrivals, runs: slice, agents: int) -> Arrivals:
+def of_runs(now: StepOutcomes, runs: slice, agents: int) -> StepOutcomes:
     """What becomes of a step in some of the runs."""
     found = []
     for receiver, sender in now.arrived:
         some = slice(*np.searchsorted(receiver, [runs.start * agents, runs.stop * agents]).tolist())
         found.append((receiver[some] - runs.start * agents, sender[some] - runs.start * agents))
-    return Arrivals(found, None if now.missed is None else now.missed[runs])
+    return StepOutcomes(found, None if now.missed is None else now.missed[runs])
 
 
-def _run_blocks(experiment: Experiment, blocks: Sequence[Block]) -> tuple[Any, np.ndarray]:
+def _run_blocks(experiment: Experiment, blocks: Sequence[RunBlock]) -> tuple[Any, np.ndarray]:
     estimator, claims = experiment.make()
     drawn = [_draw(experiment, block) for block in blocks]
     runs = sum(len(fates[0]) for fates, _ in drawn)
@@ -235,7 +235,7 @@ def _run_blocks(experiment: Experiment, blocks: Sequence[Block]) -> tuple[Any, n
         if missed is not None and missed.any():
             fates = np.concatenate([fates, np.take_along_axis(missed, np.argsort(place_of, axis=1), axis=1)], axis=1)
         different, history_of = _distinct(exchange_of, fates, 1 + max(len(e.delay) for e in events) if events else 2)
-        histories = _Histories(estimator, events, experiment.agents, exchanges, different)
+        histories = _StepPairs(estimator, events, experiment.agents, exchanges, different)
         claimed[:, step - 1] = np.take_along_axis(histories.fused()[history_of], place_of, axis=1)
         if step < len(experiment.events):
             if len(different) < MERGE_BELOW * runs:
@@ -263,7 +263,7 @@ def _kept(experiment: Experiment, claims: Claims, claimed: np.ndarray) -> Any:
     return type(kept)(*(None if c is None else c[place] for c in kept))
 
 
-class _Histories:
+class _StepPairs:
     """Different (exchange, fates) pairs of one step.
 
     Parameters
@@ -275,7 +275,7 @@ class _Histories:
     def __init__(
         self,
         estimator: Estimator,
-        events: Sequence[Event],
+        events: Sequence[ChanceEvent],
         agents: int,
         exchanges: Sequence[Exchange],
         different: np.ndarray,
@@ -315,7 +315,7 @@ class _Histories:
         return [exchange.onward(heard, late, missed) for exchange, heard, late, missed in self.each]
 
 
-class Links:
+class StepLinks:
     """Events of a step as arrays: who hears whom in which.
 
     Parameters
@@ -324,7 +324,7 @@ class Links:
     agents : number of agents.
     """
 
-    def __init__(self, drawn: Sequence[Event], agents: int) -> None:
+    def __init__(self, drawn: Sequence[ChanceEvent], agents: int) -> None:
         each = sorted((i, e.sender, number) for number, e in enumerate(drawn) for i in e.receivers)
         self.agents, self.delays = agents, max((len(event.delay) for event in drawn), default=1)
         self.receiver, self.sender, number = np.array(each, dtype=np.intp).reshape(-1, 3).T
@@ -346,14 +346,14 @@ class Links:
         return found
 
 
-def links_of(events: Sequence[Sequence[Event]], agents: int) -> list[Links]:
+def links_of(events: Sequence[Sequence[ChanceEvent]], agents: int) -> list[StepLinks]:
     """Links of every step; steps with the same list of events share them."""
     different = {id(now): now for now in events}
-    links = {key: Links(now, agents) for key, now in different.items()}
+    links = {key: StepLinks(now, agents) for key, now in different.items()}
     return [links[id(now)] for now in events]
 
 
-def _moved(fates: np.ndarray, events: Sequence[Event], place_of: np.ndarray) -> np.ndarray:
+def _moved(fates: np.ndarray, events: Sequence[ChanceEvent], place_of: np.ndarray) -> np.ndarray:
     """Fates of the events among places, from those among agents, (runs, events)."""
     number = {(event.sender, event.receivers): e for e, event in enumerate(events)}
     different, run_of = np.unique(place_of, axis=0, return_inverse=True)
@@ -378,13 +378,13 @@ def _distinct(exchange_of: np.ndarray, fates: np.ndarray, options: int) -> tuple
     return different, pair_of.ravel()
 
 
-def _draw(experiment: Experiment, block: Block) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def _draw(experiment: Experiment, block: RunBlock) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Fates and misses of a block, see `draw_fates`."""
     fates, missed = zip(*_drawn_by_step(experiment, block), strict=True)
     return list(fates), list(missed)
 
 
-def _drawn_by_step(experiment: Experiment, block: Block) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _drawn_by_step(experiment: Experiment, block: RunBlock) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     generator = stream(experiment.seed, block.row, block.number)
     size = block.size, experiment.agents
     return fates_by_step(generator, experiment.events, experiment.detections, size, block.row)
@@ -397,7 +397,7 @@ def stream(seed: int, row: int, number: int) -> np.random.Generator:
 
 def draw_fates(
     generator: np.random.Generator,
-    events: Sequence[Sequence[Event]],
+    events: Sequence[Sequence[ChanceEvent]],
     detections: Sequence[Sequence[Detection]],
     size: tuple[int, int],
     row: int = 0,
@@ -423,7 +423,7 @@ def draw_fates(
 
 def fates_by_step(
     generator: np.random.Generator,
-    events: Sequence[Sequence[Event]],
+    events: Sequence[Sequence[ChanceEvent]],
     detections: Sequence[Sequence[Detection]],
     size: tuple[int, int],
     row: int = 0,
@@ -458,7 +458,7 @@ def _comes_about(generator: np.random.Generator, p: np.ndarray, shape: tuple[int
     return out
 
 
-def _delays(events: Sequence[Event], runs: int, generator: np.random.Generator) -> np.ndarray:
+def _delays(events: Sequence[ChanceEvent], runs: int, generator: np.random.Generator) -> np.ndarray:
     """Steps that each message takes, (runs, events)."""
     drawn, late = generator.random((runs, len(events))), np.empty((runs, len(events)), dtype=np.uint8)
     for place, event in enumerate(events):

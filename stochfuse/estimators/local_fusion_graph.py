@@ -33,7 +33,7 @@ from stochfuse.estimators.ledger import COMMON, Ledger
 from stochfuse.estimators.protocol import FusionRule, Late, best_relabelling
 
 
-class Agent(NamedTuple):
+class HeldEstimate(NamedTuple):
     """An agent before an exchange: value of its local estimate and the pedigree it rests on, as a mask of nodes."""
 
     value: int
@@ -51,7 +51,7 @@ class GraphState(NamedTuple):
     """
 
     nodes: tuple[tuple[int, int], ...]
-    agents: tuple[Agent, ...]
+    agents: tuple[HeldEstimate, ...]
     late: tuple[tuple[int, int, int], ...] = ()
 
 
@@ -156,8 +156,8 @@ class LocalFusionGraph(FusionRule):
         """Everyone's initial estimate; a shared one is a common ancestor of all."""
         if self.shared:
             root = self.ledger.start(COMMON)
-            return GraphState(((root, 1),), tuple(Agent(root, 1) for _ in self.sources))
-        return GraphState((), tuple(Agent(self.ledger.start(source), 0) for source in self.sources))
+            return GraphState(((root, 1),), tuple(HeldEstimate(root, 1) for _ in self.sources))
+        return GraphState((), tuple(HeldEstimate(self.ledger.start(source), 0) for source in self.sources))
 
     def exchange(self, state: GraphState) -> GraphExchange:
         """Open the exchange of the state's step."""
@@ -183,7 +183,7 @@ class GraphExchange:
         self,
         estimator: LocalFusionGraph,
         older: Pedigrees,
-        agents: Sequence[Agent],
+        agents: Sequence[HeldEstimate],
         late: Sequence[tuple[int, int, int]] = (),
         *,
         keep: bool = False,
@@ -247,10 +247,12 @@ class GraphExchange:
 
     def _next(
         self, heard: Sequence[int], late: Sequence[Late], missed: int
-    ) -> tuple[list[Agent], dict[tuple[int, int], int]]:
+    ) -> tuple[list[HeldEstimate], dict[tuple[int, int], int]]:
         known = [self.known(i, h) for i, h in enumerate(heard)]
         local, fuse = self.estimator.ledger.local, self.pedigrees.fuse
-        agents = [Agent(local(fuse(mask), s), mask) for s, mask in zip(self.estimator.seen(missed), known, strict=True)]
+        agents = [
+            HeldEstimate(local(fuse(mask), s), mask) for s, mask in zip(self.estimator.seen(missed), known, strict=True)
+        ]
         waiting: dict[tuple[int, int], int] = {}
         if late or self.late:
             under_way = [(r, left - 1, mask) for r, left, mask in self.late if left > 0]
@@ -261,7 +263,7 @@ class GraphExchange:
         return agents, waiting
 
     def _merged(
-        self, agents: Sequence[Agent], waiting: dict[tuple[int, int], int]
+        self, agents: Sequence[HeldEstimate], waiting: dict[tuple[int, int], int]
     ) -> tuple[GraphState, tuple[int, ...]]:
         kept = 0
         for mask in waiting.values():  # a message's own node is met when it arrives
@@ -304,7 +306,9 @@ class GraphExchange:
             new = {nodes[p]: 1 << place for place, p in enumerate(sequence)}
             state = GraphState(
                 tuple([(moved(values[nodes[p]], order), _moved(below[nodes[p]] & kept, new)) for p in sequence]),
-                tuple([Agent(moved(agents[i].value, order), _moved(agents[i].known & kept, new)) for i in order]),
+                tuple(
+                    [HeldEstimate(moved(agents[i].value, order), _moved(agents[i].known & kept, new)) for i in order]
+                ),
                 tuple(sorted((place_of[r], left, _moved(m & kept, new)) for (r, left), m in waiting.items())),
             )
             if best is None or state < best[0]:

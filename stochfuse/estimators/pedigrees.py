@@ -27,7 +27,7 @@ import numpy as np
 
 from stochfuse.errors import TooManyError
 from stochfuse.estimators.ledger import COMMON, Sources, brought_forward, estimated, packed, unpacked
-from stochfuse.estimators.protocol import Arrivals
+from stochfuse.estimators.protocol import StepOutcomes
 from stochfuse.estimators.together import measured_too
 from stochfuse.kalman.kernel import Estimate
 
@@ -128,7 +128,7 @@ class GraphTogether:
     def _values(self) -> np.ndarray:
         return self._room[: self._number]
 
-    def exchange(self, now: Arrivals) -> tuple[Estimate, np.ndarray]:
+    def exchange(self, now: StepOutcomes) -> tuple[Estimate, np.ndarray]:
         """Estimates after the next step's exchange, and which of them each agent has, (runs, agents)."""
         self._step += 1
         self._locals(now.missed)

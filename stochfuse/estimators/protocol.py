@@ -125,7 +125,7 @@ class Claims(Protocol):
         ...
 
 
-class Arrivals(NamedTuple):
+class StepOutcomes(NamedTuple):
     """What becomes of a step in many outcomes.
 
     Parameters
@@ -150,7 +150,7 @@ class Together(Protocol):
     @property
     def size(self) -> int: ...
 
-    def exchange(self, now: Arrivals) -> tuple[Any, np.ndarray]:
+    def exchange(self, now: StepOutcomes) -> tuple[Any, np.ndarray]:
         """Estimates (or `Moments`) after the next step's exchange, and which of them each agent has, (runs, agents)."""
         ...
 

@@ -203,7 +203,7 @@ def numbers_of(estimator: Any, system: System, readings: Readings, runs: int) ->
     return SumNumbers(estimator, system, readings, runs)
 
 
-class _Pairs:
+class _SortedKeys:
     """Sorted keys value · runs + run, and where the numbers of each are."""
 
     def __init__(self, runs: int) -> None:
@@ -239,10 +239,10 @@ class _Pairs:
         block, row = self.place[at].T
         return block, row
 
-    def renamed(self, names: Mapping[int, int]) -> _Pairs:
+    def renamed(self, names: Mapping[int, int]) -> _SortedKeys:
         """Return those whose values have other names, under these."""
         values, runs = np.divmod(self.keys, self.runs)
-        out, new = _Pairs(self.runs), np.array([names.get(value, -1) for value in values.tolist()], dtype=np.int64)
+        out, new = _SortedKeys(self.runs), np.array([names.get(value, -1) for value in values.tolist()], dtype=np.int64)
         kept = new >= 0
         keys = out.key(new[kept], runs[kept])
         order = np.argsort(keys)
@@ -250,7 +250,7 @@ class _Pairs:
         return out
 
 
-def _closed(unknown: np.ndarray, rests_on: Callable[[np.ndarray], np.ndarray], pairs: _Pairs) -> np.ndarray:
+def _closed(unknown: np.ndarray, rests_on: Callable[[np.ndarray], np.ndarray], pairs: _SortedKeys) -> np.ndarray:
     """Unknown keys with all unknown ones that they rest on."""
     found = unknown
     while len(unknown):
@@ -276,7 +276,7 @@ class PastNumbers:
     """Numbers of an estimator that remembers pasts."""
 
     def __init__(self, estimator: RecursiveEstimator, readings: Readings, runs: int) -> None:
-        self.estimator, self.readings, self.pairs = estimator, readings, _Pairs(runs)
+        self.estimator, self.readings, self.pairs = estimator, readings, _SortedKeys(runs)
         self.blocks: list[Worked] = []
         self._groups: list[tuple[int, int, int, int]] = []
         self._rules: dict[Any, int] = {}
@@ -304,7 +304,7 @@ class PastNumbers:
         """Put what is kept into blocks of its own, one for each of the old ones."""
         keys = np.unique(self.pairs.key(values, runs))
         block, row = self.pairs.find(keys)
-        kept, self.pairs = self.blocks, _Pairs(self.pairs.runs)
+        kept, self.pairs = self.blocks, _SortedKeys(self.pairs.runs)
         self.blocks = []
         for old in np.unique(block):
             here = block == old
@@ -353,7 +353,7 @@ class SumNumbers:
     """Numbers of an estimator of sums of information, Y and y side by side."""
 
     def __init__(self, estimator: FusionRule, system: System, readings: Readings, runs: int) -> None:
-        self.estimator, self.system, self.readings, self.pairs = estimator, system, readings, _Pairs(runs)
+        self.estimator, self.system, self.readings, self.pairs = estimator, system, readings, _SortedKeys(runs)
         self._sources = sources_of(system, np.zeros((1, system.agents, 1)))
         d = system.dimension
         self._packed = np.zeros((0, d, d + 1))
@@ -387,7 +387,7 @@ class SumNumbers:
         keys = np.unique(self.pairs.key(values, runs))
         before = self._resting(keys)
         keys = np.unique(np.concatenate([keys, before[self.pairs.known(before)]]))
-        packed, self.pairs = self._gathered(keys), _Pairs(self.pairs.runs)
+        packed, self.pairs = self._gathered(keys), _SortedKeys(self.pairs.runs)
         self.pairs.add(keys, 0)
         self._packed = packed
 

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from stochfuse.estimators.ledger import COMMON, Sources, brought_forward, estimated, packed, unpacked
-from stochfuse.estimators.protocol import Arrivals
+from stochfuse.estimators.protocol import StepOutcomes
 from stochfuse.estimators.recursion import FusionStep, RecursiveEstimator, Worked, worked_out
 from stochfuse.kalman.kernel import Estimate
 from stochfuse.kalman.metrics import Moments
@@ -48,7 +48,7 @@ class NaiveTogether:
         """Numbers held of every run, about."""
         return (3 + 2 * len(self._late)) * self._values.size // self.runs
 
-    def exchange(self, now: Arrivals) -> tuple[Estimate, np.ndarray]:
+    def exchange(self, now: StepOutcomes) -> tuple[Estimate, np.ndarray]:
         """Estimates after the next step's exchange, and which of them each agent has, (runs, agents)."""
         from scipy.sparse import csr_array
 
@@ -109,7 +109,7 @@ class PastsTogether:
         held = sum(part.size for part in self._now if part is not None)
         return (3 + 2 * len(self._late)) * held // self.runs
 
-    def exchange(self, now: Arrivals) -> tuple[Estimate | Moments, np.ndarray]:
+    def exchange(self, now: StepOutcomes) -> tuple[Estimate | Moments, np.ndarray]:
         """Estimates after the next step's exchange, and which of them each agent has, (runs, agents)."""
         self._step += 1
         if self._step > 1:

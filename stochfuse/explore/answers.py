@@ -20,7 +20,7 @@ import numpy as np
 from stochfuse.engines.progress import Progress, listening
 from stochfuse.errors import StochfuseError, TooManyError, UsageError
 from stochfuse.explore.network import Picture, picture
-from stochfuse.explore.state import COARSE, FINE, POWER, ROUGH, RUNS, Asked, links_of
+from stochfuse.explore.state import COARSE, FINE, POWER, ROUGH, RUNS, PageInput, links_of
 from stochfuse.prediction.compare import EstimatorComparison, compare_estimators
 from stochfuse.prediction.predict import EASY, EASY_EXCHANGE, exchange_of, predict_several
 from stochfuse.questions.least_link import least_link
@@ -80,7 +80,7 @@ class Curve(NamedTuple):
     sampled: bool = False
 
 
-class Told(NamedTuple):
+class PageAnswer(NamedTuple):
     """Something in words and numbers.
 
     Parameters
@@ -93,20 +93,20 @@ class Told(NamedTuple):
     value: Any = None
 
 
-def quick(asked: Asked) -> Iterator[tuple[str, Callable[[], Any]]]:
+def quick(asked: PageInput) -> Iterator[tuple[str, Callable[[], Any]]]:
     """Questions whose answers come at once, by name, in the order of their hardness."""
     yield SIMPLIFIED, lambda: _predicted(asked, SIMPLIFIED)
     yield "network", lambda: picture(asked)
     yield "sensitivity", lambda: _with_sensitivity(asked)
 
 
-def least(asked: Asked) -> Iterator[tuple[str, Callable[[], Any]]]:
+def least(asked: PageInput) -> Iterator[tuple[str, Callable[[], Any]]]:
     """The question that a dragged target asks again and again."""
     if asked.target is not None:
         yield "least", lambda: _least(asked)
 
 
-def exact(asked: Asked) -> Iterator[tuple[str, Callable[[], Any]]]:
+def exact(asked: PageInput) -> Iterator[tuple[str, Callable[[], Any]]]:
     """Questions whose answers may take their time."""
     yield OPTIMAL, lambda: _predicted(asked, OPTIMAL)
     yield "messages", lambda: _load(asked)
@@ -114,7 +114,7 @@ def exact(asked: Asked) -> Iterator[tuple[str, Callable[[], Any]]]:
         yield f"estimator {name}", lambda name=name: _estimated(asked, name)
 
 
-def _predicted(asked: Asked, method: str) -> list[Curve]:
+def _predicted(asked: PageInput, method: str) -> list[Curve]:
     if not {"claimed", "actual"} & set(asked.quantities):
         return []
 
@@ -126,7 +126,7 @@ def _predicted(asked: Asked, method: str) -> list[Curve]:
     return _curves(asked, method, ("claimed",), FINE, at)
 
 
-def _estimated(asked: Asked, name: str) -> list[Curve]:
+def _estimated(asked: PageInput, name: str) -> list[Curve]:
     """As `compare` does it unasked: exactly where that is easy, else sampled, by fewer runs and links."""
 
     def by(method: str, **settings: Any) -> Callable[..., list[Any]]:
@@ -146,7 +146,9 @@ def _estimated(asked: Asked, name: str) -> list[Curve]:
         return _curves(asked, name, asked.quantities, ROUGH, by(MONTE_CARLO, runs=RUNS, workers=1))
 
 
-def _curves(asked: Asked, name: str, quantities: Sequence[str], grid: str, at: Callable[..., list[Any]]) -> list[Curve]:
+def _curves(
+    asked: PageInput, name: str, quantities: Sequence[str], grid: str, at: Callable[..., list[Any]]
+) -> list[Curve]:
     """Ask along the axis and at the present links, in one go where the one contains the other."""
     metric, agent, kind = asked.measure, asked.agent, asked.kind
 
@@ -181,15 +183,15 @@ def _line(x: np.ndarray, view: PredictionView, pick: Any) -> Line:
     return Line(x, y) if ends is None else Line(x, y, ends[0][pick], ends[1][pick])
 
 
-def _least(asked: Asked) -> Told:
+def _least(asked: PageInput) -> PageAnswer:
     """The least link probability that meets the target."""
     if asked.kind != "link":
-        return Told("The least µ for a target is asked of links that are all alike.")
+        return PageAnswer("The least µ for a target is asked of links that are all alike.")
     found = least_link(asked.alike, asked.target or 0.0, of=asked.metric, agent=asked.agent, method=SIMPLIFIED)
-    return Told(f"Least µ for {asked.target:g}: {found.link:.9g} ({SIMPLIFIED})", float(found.link))
+    return PageAnswer(f"Least µ for {asked.target:g}: {found.link:.9g} ({SIMPLIFIED})", float(found.link))
 
 
-def _with_sensitivity(asked: Asked) -> Picture:
+def _with_sensitivity(asked: PageInput) -> Picture:
     """The network with what each link is worth."""
     drawn = picture(asked)
     at = asked.link if asked.kind == "link" else None
@@ -203,17 +205,17 @@ def _with_sensitivity(asked: Asked) -> Picture:
     return drawn.weighed(worth, first)
 
 
-def _load(asked: Asked) -> Told:
+def _load(asked: PageInput) -> PageAnswer:
     """Mean nodes that the messages of a step bring an agent, of both rules at every step."""
     link = [asked.link] if asked.kind == "link" and asked.link is not None else None
     agent = asked.agent if isinstance(asked.agent, int) else "mean"
     loads = [message_load(asked.scenario, link, rule) for rule in RULES]
     by_step = np.array([[load.between(k, k).mean(agent)[0] for k in load.steps] for load in loads])
     means = ", ".join(f"{load.rule} {load.mean(agent)[0]:.5g}" for load in loads)
-    return Told(f"Nodes new to an agent per step, mean over the steps: {means} (exact)", by_step)
+    return PageAnswer(f"Nodes new to an agent per step, mean over the steps: {means} (exact)", by_step)
 
 
-class Work:
+class QuestionWorker:
     """Follows the question that was asked last, in a thread.
 
     Parameters
@@ -227,7 +229,7 @@ class Work:
         self._deliver, self._jobs = deliver, jobs
         self.number = 0
 
-    def ask(self, asked: Asked) -> int:
+    def ask(self, asked: PageInput) -> int:
         """Begin with a question, and give up the one before."""
         self.number += 1
         threading.Thread(target=self._follow, args=(self.number, asked), name="stochfuse-page", daemon=True).start()
@@ -237,7 +239,7 @@ class Work:
         """Give up what is being done."""
         self.number += 1
 
-    def _follow(self, number: int, asked: Asked) -> None:
+    def _follow(self, number: int, asked: PageInput) -> None:
         first, *behind = self._jobs
         try:
             for name, job in first(asked):
@@ -278,7 +280,7 @@ class Superseded(Exception):  # noqa: N818
 
 
 class _Listener(Progress):
-    def __init__(self, work: Work, number: int, name: str) -> None:
+    def __init__(self, work: QuestionWorker, number: int, name: str) -> None:
         self._work, self._number, self._name, self._said = work, number, name, monotonic()
 
     def advance(self, what: str, done: int, total: int) -> None:
@@ -301,7 +303,7 @@ def records(curves: Sequence[Curve]) -> str:
     return to_csv(headings, [[row.get(key, "") for key in headings] for row in rows])
 
 
-def report(asked: Asked, curves: Sequence[Curve]) -> Report:
+def report(asked: PageInput, curves: Sequence[Curve]) -> Report:
     """Return what the curves show as a report: the estimators side by side, or without any the first quick engine."""
     views = {curve.name: curve.views[0] for curve in curves}
     found = [views[name].prediction for name in asked.estimators if name in views]
@@ -311,16 +313,16 @@ def report(asked: Asked, curves: Sequence[Curve]) -> Report:
     return estimator_report(EstimatorView(compared, asked.measure, asked.agent, quantities=asked.quantities))
 
 
-def page_of(asked: Asked, curves: Sequence[Curve]) -> str:
+def page_of(asked: PageInput, curves: Sequence[Curve]) -> str:
     """Return a page to be sent, as --report writes it."""
     words = asked.commands([c.name for c in curves if c.sampled])
     chosen = next((line for line in words if " compare " in line), words[0])
     said = dict.fromkeys(note for c in curves for view in c.views for note in view.prediction.notes)
-    told = document.Told(shlex.split(chosen)[1:], asked.scenario.to_mapping(), tuple(said))
+    told = document.DocumentNote(shlex.split(chosen)[1:], asked.scenario.to_mapping(), tuple(said))
     return document.document(report(asked, curves), told)
 
 
-def figure_of(asked: Asked, curves: Sequence[Curve]) -> str:
+def figure_of(asked: PageInput, curves: Sequence[Curve]) -> str:
     """Return the figure, as --plot draws it.
 
     Raises

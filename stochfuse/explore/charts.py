@@ -26,12 +26,12 @@ from bokeh.plotting import figure
 
 from stochfuse.explore.answers import Curve, Line
 from stochfuse.explore.network import Picture
-from stochfuse.explore.state import Asked
+from stochfuse.explore.state import PageInput
 from stochfuse.report.plot import COLORS
 from stochfuse.scenario.registry import ESTIMATORS, OPTIMAL, SIMPLIFIED
 
 
-class Look(NamedTuple):
+class ThemeColours(NamedTuple):
     """Colours of a theme."""
 
     back: str
@@ -42,15 +42,15 @@ class Look(NamedTuple):
 
 
 SHADES = cividis(256)
-LIGHT = Look("#ffffff", "#1b1b1b", "#dcdcdc", COLORS, tuple(reversed(SHADES[:215])))
-DARK = Look(
+LIGHT = ThemeColours("#ffffff", "#1b1b1b", "#dcdcdc", COLORS, tuple(reversed(SHADES[:215])))
+DARK = ThemeColours(
     "#16181b", "#ececec", "#3a3e43",
     ("#56B4E9", "#E69F00", "#2FC79A", "#E59BC5", "#F0E442", "#FF8A50", "#FFFFFF", "#C9B27A"), SHADES[60:],
 )  # fmt: skip
 DASH = {"claimed": "dashed", "actual": "solid", "consistency": "solid", "bias": "dotted", "rms": "dotdash"}
 
 
-def colour(name: str, look: Look) -> str:
+def colour(name: str, look: ThemeColours) -> str:
     """Colour of a series, the same whatever else is shown."""
     place = {SIMPLIFIED: 0, OPTIMAL: 6}.get(name)
     if place is None:
@@ -118,14 +118,14 @@ class Chart:
         self.figure.add_layout(line)
         return line
 
-    def dress(self, look: Look) -> None:
+    def dress(self, look: ThemeColours) -> None:
         """Put on the colours of a theme."""
         dress(self.figure, look)
         for line in self.figure.select({"type": Span}):
             line.line_color = line.hover_line_color = look.ink
 
 
-def dress(plot: Any, look: Look) -> None:
+def dress(plot: Any, look: ThemeColours) -> None:
     """Put the colours of a theme on a figure."""
     plot.background_fill_color = plot.border_fill_color = look.back
     plot.outline_line_color = look.grid
@@ -150,7 +150,7 @@ def key_of(lines: Sequence[tuple[str, str, str, Line]]) -> str:
     )
 
 
-def lines_of(curves: Sequence[Curve], look: Look, along: str) -> list[tuple[str, str, str, Line]]:
+def lines_of(curves: Sequence[Curve], look: ThemeColours, along: str) -> list[tuple[str, str, str, Line]]:
     """Curves as `Chart.show` takes them, along "over" or "steps"."""
     return [
         (
@@ -202,7 +202,7 @@ class NetworkChart:
         )
         self.figure.add_layout(self._bar, "right")
 
-    def show(self, picture: Picture, asked: Asked) -> None:
+    def show(self, picture: Picture, asked: PageInput) -> None:
         """Draw a network."""
         pairs = picture.pairs
         arcs = [picture.arc(*pair) for pair in pairs]
@@ -239,7 +239,7 @@ class NetworkChart:
         label = f"Network of {len(picture.names)} agents, {len(pairs)} links. {text}"
         self.figure.html_attributes = {"role": "img", "aria-label": label}
 
-    def dress(self, look: Look) -> None:
+    def dress(self, look: ThemeColours) -> None:
         """Put on the colours of a theme."""
         dress(self.figure, look)
         self._mu.palette, self._error.palette = list(look.links), list(look.links)

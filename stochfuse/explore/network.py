@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from stochfuse.errors import StochfuseError
-from stochfuse.explore.state import Asked
+from stochfuse.explore.state import PageInput
 from stochfuse.prediction.predict import predict
 from stochfuse.report.network_figure import BEND, LEAST
 from stochfuse.scenario.known_links import links_of_scenario
@@ -74,7 +74,7 @@ class Picture:
         """A link in words."""
         return f"{self.names[pair[1]]} → {self.names[pair[0]]}"
 
-    def about_link(self, pair: tuple[int, int], asked: Asked) -> str:
+    def about_link(self, pair: tuple[int, int], asked: PageInput) -> str:
         """Say what a link is and what it is worth."""
         at = f" in step {self.step}" if self.step else ""
         text = f"Link {self.name(pair)}: µ = {self.link[pair]:.4g}{at}."
@@ -88,7 +88,7 @@ class Picture:
             f"simplified); rank {rank} of {len(self.worth)}.{best}"
         )
 
-    def about_agent(self, i: int, asked: Asked) -> str:
+    def about_agent(self, i: int, asked: PageInput) -> str:
         """Say what an agent has and gets."""
         scenario = asked.scenario
         sensor = scenario.sensors[scenario.sensor_of[i]]
@@ -103,7 +103,7 @@ class Picture:
         return f"Agent {self.names[i]}: {seen}; hears {len(heard)} other(s){mean}.{error}"
 
 
-def picture(asked: Asked) -> Picture:
+def picture(asked: PageInput) -> Picture:
     """Return the network of what is asked, without what its links are worth.
 
     Raises

@@ -35,10 +35,10 @@ from bokeh.models import (
 
 from stochfuse.errors import StochfuseError, UsageError
 from stochfuse.explore import answers, state
-from stochfuse.explore.answers import Curve, Line, Told, Work
+from stochfuse.explore.answers import Curve, Line, PageAnswer, QuestionWorker
 from stochfuse.explore.charts import DARK, LIGHT, Chart, NetworkChart, key_of, lines_of
 from stochfuse.explore.network import Picture
-from stochfuse.explore.state import Asked, Given, field_of
+from stochfuse.explore.state import OpenedScenario, PageInput, field_of
 from stochfuse.scenario.registry import ESTIMATORS, LFG, SIMPLIFIED
 from stochfuse.scenario.scenario import preset_names
 
@@ -63,21 +63,21 @@ class Page:
     given : the scenario that it begins with.
     """
 
-    def __init__(self, doc: Any, given: Given) -> None:
+    def __init__(self, doc: Any, given: OpenedScenario) -> None:
         self._doc, self._begun, self._logs = doc, given, {}
-        self._presets: dict[str, Given] = {given.name: given}
+        self._presets: dict[str, OpenedScenario] = {given.name: given}
         self._sheet = InlineStyleSheet(css=(HERE / "fields.css").read_text(encoding="utf-8"))
         self._quiet = self._waiting = False
         self._opening = 0
         self._curves: dict[str, list[Curve]] = {}
         self._refused: dict[str, str] = {}
         self._picture: Picture | None = None
-        self._loads: Told | None = None
+        self._loads: PageAnswer | None = None
         self._pointed: Any = None
         self._changed: dict[tuple[int, int], float] = {}
         self._touched = False
-        self._work = Work(lambda *said: self._hand_on(self._work, *said))
-        self._work_least = Work(lambda *said: self._hand_on(self._work_least, *said), (answers.least,))
+        self._work = QuestionWorker(lambda *said: self._hand_on(self._work, *said))
+        self._work_least = QuestionWorker(lambda *said: self._hand_on(self._work_least, *said), (answers.least,))
         self._build()
         self._dress()
         self.asked = self._begin(given)
@@ -201,9 +201,9 @@ class Page:
 
     # what is asked
 
-    def _begin(self, given: Given) -> Asked:
+    def _begin(self, given: OpenedScenario) -> PageInput:
         """Fill the fields from a scenario."""
-        scenario = Asked(given).scenario
+        scenario = PageInput(given).scenario
         network, f = scenario.network, self._fields
         own = network.link is not None or bool(network.cases)
         self._given, self._changed, self._pointed, self._touched = given, {}, None, False
@@ -221,9 +221,9 @@ class Page:
         f["agent"].value = str(scenario.agent or "mean")
         self._base = scenario
         self._quiet = False
-        return Asked(given)
+        return PageInput(given)
 
-    def _read(self) -> Asked:
+    def _read(self) -> PageInput:
         """Return what the fields ask.
 
         Raises
@@ -234,7 +234,7 @@ class Page:
         f, base = self._fields, self._base.network
         alike = f["links"].value == ALIKE
         agents = f["agents"].value if f["agents"].value != base.agents else None
-        asked = Asked(
+        asked = PageInput(
             self._given,
             agents=agents,
             steps=f["steps"].value if f["steps"].value != base.steps else None,
@@ -286,7 +286,7 @@ class Page:
                 mapping = state.opened(name, content, logs)
                 if mapping is None:
                     logs[name] = content
-                found: Any = Given(name, mapping) if mapping is not None else state.with_log(given, name, logs)
+                found: Any = OpenedScenario(name, mapping) if mapping is not None else state.with_log(given, name, logs)
             except (StochfuseError, MemoryError) as error:
                 found = error
             self._doc.add_next_tick_callback(lambda: self._opened(number, found, logs))
@@ -388,11 +388,11 @@ class Page:
 
     # answers
 
-    def _hand_on(self, work: Work, number: int, name: str, found: Any) -> None:
+    def _hand_on(self, work: QuestionWorker, number: int, name: str, found: Any) -> None:
         """Bring an answer from its thread to the document."""
         self._doc.add_next_tick_callback(lambda: self._answered(work, number, name, found))
 
-    def _answered(self, work: Work, number: int, name: str, found: Any) -> None:
+    def _answered(self, work: QuestionWorker, number: int, name: str, found: Any) -> None:
         if number != work.number:
             return
         if isinstance(found, Exception):
@@ -405,7 +405,7 @@ class Page:
         elif isinstance(found, Picture):
             self._picture = found
             self._show_network()
-        elif name == "messages" and isinstance(found, Told):
+        elif name == "messages" and isinstance(found, PageAnswer):
             self._show_load(found)
         elif name == "least":
             self._show_least(found)
@@ -442,7 +442,7 @@ class Page:
         for chart in (self._over, self._steps):
             chart.figure.styles = {"opacity": "1"}
 
-    def _show_load(self, found: Told) -> None:
+    def _show_load(self, found: PageAnswer) -> None:
         steps = self._curves[SIMPLIFIED][0].views[0].prediction.steps if self._curves.get(SIMPLIFIED) else None
         x = steps if steps is not None else range(1, found.value.shape[1] + 1)
         names, colors = ("Local Fusion Graph", "naive"), (self._look.curves[0], self._look.curves[1])
@@ -456,7 +456,7 @@ class Page:
         self._said_load.text = escape(found.text)
 
     def _show_least(self, found: Any) -> None:
-        if isinstance(found, Told):
+        if isinstance(found, PageAnswer):
             self._least.location, self._least.visible = found.value, found.value is not None
             self._said_least.text = escape(found.text) + ". Drag the line, or type a target."
         else:
@@ -570,7 +570,7 @@ class Page:
         else:
             threading.Thread(target=self._draw, args=(kind, asked, curves), daemon=True).start()
 
-    def _draw(self, kind: str, asked: Asked, curves: list[Curve]) -> None:
+    def _draw(self, kind: str, asked: PageInput, curves: list[Curve]) -> None:
         try:
             text = answers.page_of(asked, curves) if kind == "Report" else answers.figure_of(asked, curves)
         except StochfuseError as error:

@@ -12,13 +12,13 @@ from collections.abc import Callable
 from typing import Any
 
 from stochfuse.errors import UsageError, needed
-from stochfuse.explore.state import MOST_BYTES, Given
+from stochfuse.explore.state import MOST_BYTES, OpenedScenario
 
 FIRST_PORT, PORTS = 5006, 10
 LOOPBACK = "127.0.0.1"
 
 
-def serve(given: Given, port: int | None, address: str, started: Callable[[str], Any]) -> None:
+def serve(given: OpenedScenario, port: int | None, address: str, started: Callable[[str], Any]) -> None:
     """Serve the page until the process is ended.
 
     Parameters

@@ -50,7 +50,7 @@ SCENARIO_SUFFIXES, LOG_SUFFIXES = (".toml", ".json"), (".csv", ".txt", ".tsv")
 SUFFIXES = (*SCENARIO_SUFFIXES, *LOG_SUFFIXES)
 
 
-class Given(NamedTuple):
+class OpenedScenario(NamedTuple):
     """A scenario as it came: a preset, a file named on the command line, or one opened in the page.
 
     Parameters
@@ -63,7 +63,7 @@ class Given(NamedTuple):
     mapping: Mapping[str, Any]
 
 
-def begun(source: str) -> Given:
+def begun(source: str) -> OpenedScenario:
     """Return the scenario that the command line names, a file of links only out of its own folder.
 
     Raises
@@ -78,7 +78,7 @@ def begun(source: str) -> Given:
     if file is not None and not (folder / file).resolve().is_relative_to(folder):
         raise ScenarioError(name, [Problem("network.link.file", f"a file within {folder}", f"'{file}'")])
     mapping = mapping if is_preset(source) else with_links(mapping, name, folder)
-    return Given(source if source != "-" else FILE, mapping)
+    return OpenedScenario(source if source != "-" else FILE, mapping)
 
 
 def _link_file(mapping: Any) -> str | None:
@@ -151,7 +151,7 @@ def logged(name: str, logs: Mapping[str, bytes]) -> Any:
     return _in_folder(name, logs[name], lambda folder, inside: read_links(folder / inside))
 
 
-def with_log(given: Given, name: str, logs: Mapping[str, bytes]) -> Given:
+def with_log(given: OpenedScenario, name: str, logs: Mapping[str, bytes]) -> OpenedScenario:
     """Return a scenario with the links of an opened file in the place of its own, and as many agents as it has nodes.
 
     Raises
@@ -167,11 +167,11 @@ def with_log(given: Given, name: str, logs: Mapping[str, bytes]) -> Given:
     made = _in_folder(
         name, logs[name], lambda folder, inside: with_links(_renamed(mapping, inside), given.name, folder)
     )
-    return Given(FILE, made)
+    return OpenedScenario(FILE, made)
 
 
 @dataclass(frozen=True)
-class Asked:
+class PageInput:
     """What is asked.
 
     Parameters
@@ -188,7 +188,7 @@ class Asked:
     target : a value to be met, or None.
     """
 
-    given: Given
+    given: OpenedScenario
     agents: int | None = None
     steps: int | None = None
     architecture: str | None = None
@@ -227,9 +227,9 @@ class Asked:
                     f"{name}: expected at most {most} on this page, got {number}; the command line has more"
                 )
         if self.power is not None:
-            made = _loaded(Given(self.given.name, put(made.to_mapping(), {POWER: self.power})))
+            made = _loaded(OpenedScenario(self.given.name, put(made.to_mapping(), {POWER: self.power})))
         if self.changed:
-            made = _loaded(Given(self.given.name, self._with_changed(made)))
+            made = _loaded(OpenedScenario(self.given.name, self._with_changed(made)))
         return made
 
     def _with_changed(self, made: Scenario) -> dict[str, Any]:
@@ -251,7 +251,7 @@ class Asked:
         """The same without its own links: what one probability for all is asked of."""
         if self.kind == "link":
             return self.scenario
-        return _loaded(Given(self.scenario.name, self.scenario.to_mapping()), uniform=True)
+        return _loaded(OpenedScenario(self.scenario.name, self.scenario.to_mapping()), uniform=True)
 
     @property
     def kind(self) -> str:
@@ -282,7 +282,7 @@ class Asked:
         """Whether options say all that is changed."""
         return not self.changed and self.given.name != FILE
 
-    def changing(self, **values: Any) -> Asked:
+    def changing(self, **values: Any) -> PageInput:
         """Return the same with something else asked; a change of size forgets changes of single links."""
         forget = {"changed": ()} if {"given", "agents", "architecture", "link"} & set(values) else {}
         return replace(self, **{**forget, **values})
@@ -372,7 +372,7 @@ def _word(value: Any) -> str:
     return f"{value:.12g}" if isinstance(value, float) else str(value)
 
 
-def _loaded(given: Given, *, uniform: bool = False, **options: Any) -> Scenario:
+def _loaded(given: OpenedScenario, *, uniform: bool = False, **options: Any) -> Scenario:
     """A scenario under the name it came by."""
     if is_preset(given.name) and given.mapping == preset(given.name).mapping:
         return load_scenario(given.name, uniform_link=uniform, **options)
@@ -382,9 +382,9 @@ def _loaded(given: Given, *, uniform: bool = False, **options: Any) -> Scenario:
         raise ScenarioError(given.name, error.problems or str(error).partition(": ")[2]) from None
 
 
-def preset(name: str) -> Given:
+def preset(name: str) -> OpenedScenario:
     """Return a preset as it comes."""
-    return Given(name, parse(name, read_text(name)[1]))
+    return OpenedScenario(name, parse(name, read_text(name)[1]))
 
 
 def links_of(text: str) -> list[float]:

@@ -33,8 +33,8 @@ import numpy as np
 from stochfuse.errors import NoAnswerError, UsageError
 from stochfuse.fusion.intersection_weights import (
     Criterion,
+    DiagonalPairs,
     Directions,
-    Pairs,
     best_weights,
     certificate,
     diagonalise,
@@ -208,7 +208,7 @@ def _fuse(
     return Stack(weights, C, gains, residual), independent @ NUMPY.transpose(independent)
 
 
-def _fuse_pairs(pairs: Pairs, name: str, given: np.ndarray | None) -> Stack:
+def _fuse_pairs(pairs: DiagonalPairs, name: str, given: np.ndarray | None) -> Stack:
     w = weights_of(pairs, name) if given is None else given[:, 0]
     a, b = w[:, None] * pairs.beta, (1.0 - w[:, None]) * pairs.alpha
     bottom = a + b  # zero where one is exact and has no weight: it decides in the limit

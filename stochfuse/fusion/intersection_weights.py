@@ -444,7 +444,7 @@ EQUAL = 2e-15
 """Largest |δ| per dimension of two covariances that are equal to rounding, and 1 − |δ| of which one has no error."""
 
 
-class Pairs(NamedTuple):
+class DiagonalPairs(NamedTuple):
     """N pairs: T (N, d, d), empty where it was not asked for, and α, β, δ = β − α (N, d)."""
 
     T: np.ndarray
@@ -481,7 +481,7 @@ def pair_weights(A: np.ndarray, B: np.ndarray, criterion: str = "det") -> np.nda
     return weights_of(diagonalise(A, B, basis=criterion == "trace"), criterion)
 
 
-def diagonalise(A: np.ndarray, B: np.ndarray, *, basis: bool = True) -> Pairs:
+def diagonalise(A: np.ndarray, B: np.ndarray, *, basis: bool = True) -> DiagonalPairs:
     """Bring each pair to diagonal form, T only if the basis is wanted.
 
     Raises
@@ -509,10 +509,10 @@ def diagonalise(A: np.ndarray, B: np.ndarray, *, basis: bool = True) -> Pairs:
     # what rounding leaves of a direction without error is none: it would call for a weight of its square root
     certain = 1.0 - np.abs(delta) <= EQUAL * delta.shape[-1]
     delta = np.where(certain, np.sign(delta), np.clip(delta, -1.0, 1.0))
-    return Pairs(T, 0.5 * (1.0 - delta), 0.5 * (1.0 + delta), delta)
+    return DiagonalPairs(T, 0.5 * (1.0 - delta), 0.5 * (1.0 + delta), delta)
 
 
-def weights_of(pairs: Pairs, name: str) -> np.ndarray:
+def weights_of(pairs: DiagonalPairs, name: str) -> np.ndarray:
     """Weights (N,) of A of least determinant ("det") or trace."""
     shares = _shares(pairs, name)
     q0, q1, delta = (np.ascontiguousarray(part.T) for part in (pairs.alpha, pairs.beta, pairs.delta))
@@ -527,7 +527,7 @@ def weights_of(pairs: Pairs, name: str) -> np.ndarray:
     return weights
 
 
-def excess(pairs: Pairs, name: str, weights: np.ndarray) -> np.ndarray:
+def excess(pairs: DiagonalPairs, name: str, weights: np.ndarray) -> np.ndarray:
     """Bound (N,) on the excess of the criterion, relative (of log det): slope times way to the better end."""
     shares = _shares(pairs, name)
     q = weights * pairs.beta.T + (1.0 - weights) * pairs.alpha.T
@@ -539,7 +539,7 @@ def excess(pairs: Pairs, name: str, weights: np.ndarray) -> np.ndarray:
     return np.divide(gap, size, out=np.zeros_like(gap), where=np.asarray(size) > 0)
 
 
-def _shares(pairs: Pairs, name: str) -> np.ndarray:
+def _shares(pairs: DiagonalPairs, name: str) -> np.ndarray:
     """What multiplies δ/q (det) or δ/q² (trace), shape (d, N)."""
     if name == "det":
         return np.ones(pairs.delta.shape[::-1])

@@ -343,7 +343,7 @@ def at_step(matrix: np.ndarray, step: int) -> np.ndarray:
     return matrix if matrix.ndim == 2 else matrix[step - 1]
 
 
-class Numbers(Protocol):
+class SquareRootNumbers(Protocol):
     """What the numbers of a recursion in square-root form go through."""
 
     def factor(self, P: np.ndarray) -> np.ndarray:

@@ -190,7 +190,7 @@ def carry(
         rows[:] = upper(P[block] if P.ndim == 3 else P[None])
         if isinstance(share, np.ndarray):
             rows *= share[block]
-        held = _Scalars(rows, arrays[1]) if d == 1 else _Block(d, p, *arrays)
+        held = _Scalars(rows, arrays[1]) if d == 1 else _FilterBlock(d, p, *arrays)
         for k, step in enumerate(through):
             if not k or step is not through[k - 1]:
                 held.prepare(step.take(block))
@@ -219,7 +219,7 @@ def _aligned(size: int) -> np.ndarray:
     return memory[first : first + size]
 
 
-class _Block:
+class _FilterBlock:
     """A block of filters with several states, and the memory that it works in."""
 
     def __init__(

@@ -82,7 +82,7 @@ SEPARATE = 1 << 20
 """First block of the further runs: beyond any that a sample comes to."""
 
 
-class Expected(NamedTuple):
+class ControlExpectation(NamedTuple):
     """The optimum's expectation.
 
     Parameters
@@ -116,7 +116,7 @@ class Control:
     """
 
     runs: Moments
-    expected: Expected
+    expected: ControlExpectation
 
     def corrected(self, y: Moments, row: int, step: int, group: Sequence[int]) -> tuple[Moments, Moments | None]:
         """Terms of the sum, (runs, …), and what the further runs do to their mean, block by block, (blocks, …).
@@ -231,16 +231,16 @@ class Followed:
         self.kind = HEARD if how.estimator == OPTIMAL else KIND
 
     @cached_property
-    def expected(self) -> Expected | None:
+    def expected(self) -> ControlExpectation | None:
         """What is expected of it; None where that is not cheap."""
         system, links, _ = self._asked
         if self.kind == KIND:
             return expectation(system, links)
         if self.heard is None:
             return None
-        return Expected(self.heard.expected(), np.zeros((len(links.link), system.steps)))
+        return ControlExpectation(self.heard.expected(), np.zeros((len(links.link), system.steps)))
 
-    def expected_beside(self, runs: int) -> Expected | None:
+    def expected_beside(self, runs: int) -> ControlExpectation | None:
         """What is expected of it, and how far a mean of so many runs may be off by what they did not meet."""
         found = self.expected
         if found is None or self.kind == KIND:
@@ -279,7 +279,7 @@ class Followed:
         return Moments.of_optimum(*self._found)
 
 
-def expectation(system: System, links: LinkRows) -> Expected | None:
+def expectation(system: System, links: LinkRows) -> ControlExpectation | None:
     """Return the optimum's expectation by the contact chain; None where that is not cheap, or no better than bounds."""
     n, steps, rows = system.agents, system.steps, len(links.link)
     alike = by_number(system, links)
@@ -305,10 +305,10 @@ def expectation(system: System, links: LinkRows) -> Expected | None:
         return None
     # of every agent, whose group it is in
     P, b, M = (m if m is None else np.repeat(m, n, axis=2) if alike else m for m in found[:3])
-    return Expected(Moments(P, P, None, P) if system.error is None else Moments(P, P, b, M), found.bound)
+    return ControlExpectation(Moments(P, P, None, P) if system.error is None else Moments(P, P, b, M), found.bound)
 
 
-def estimated(system: System, links: LinkRows, how: Settings, correlation: float) -> Expected:
+def estimated(system: System, links: LinkRows, how: Settings, correlation: float) -> ControlExpectation:
     """Estimate the optimum's expectation from further runs that carry it alone.
 
     Parameters
@@ -326,7 +326,7 @@ def estimated(system: System, links: LinkRows, how: Settings, correlation: float
     found = [_mean(follow(first=SEPARATE + block)) for block in range(blocks)]
     means = Moments(*(None if m[0] is None else np.stack(m, axis=1) for m in zip(*found, strict=True)))
     bound = np.zeros((len(links.link), system.steps))
-    return Expected(means.map(lambda m: m.mean(axis=1)), bound, means, blocks * size / how.runs)
+    return ControlExpectation(means.map(lambda m: m.mean(axis=1)), bound, means, blocks * size / how.runs)
 
 
 def _mean(drawn: OptimumSample) -> Moments:

@@ -539,7 +539,7 @@ def outcomes(
     if _common(system, links) is None or plain or how.prune or records is not None:
         found = _enumerated(system, links, how, records=records, errors=errors, plain=plain)
     else:
-        found = _kept(_Structure.of(system, how, errors))
+        found = _kept(_StructureKey.of(system, how, errors))
     return Outcomes(system, links, found, errors, records)
 
 
@@ -552,7 +552,7 @@ def _common(system: System, links: LinkRows) -> np.ndarray | None:
 
 
 @dataclass(frozen=True)
-class _Structure:
+class _StructureKey:
     """All that outcomes under one µ depend on; equal where that is.
 
     Parameters
@@ -567,7 +567,7 @@ class _Structure:
     how: Settings = field(compare=False)
 
     @classmethod
-    def of(cls, system: System, how: Settings, errors: bool) -> _Structure:
+    def of(cls, system: System, how: Settings, errors: bool) -> _StructureKey:
         estimator = (how.estimator, how.max_graphs, how.criterion)
         # what is not a sum of information may look at numbers of the system while it writes down pasts
         own = () if how.estimator in SUMS else (id(system),)
@@ -575,7 +575,7 @@ class _Structure:
 
 
 @lru_cache(maxsize=KEPT)
-def _kept(asked: _Structure) -> Enumerated:
+def _kept(asked: _StructureKey) -> Enumerated:
     network = asked.system.network
     return _enumerated(asked.system, restricted(uniform_rows([0.5]), network), asked.how, errors=asked.errors)
 
@@ -633,8 +633,8 @@ def _over_items(system: System, link: np.ndarray, items: Items, how: Settings, e
     noises = items.noises._replace(P0=np.broadcast_to(P0, (len(items), *system.P0.shape)))
     # the system's own first covariance is not used, and may be one that has no inverse
     plain = system.with_noises(Noises(P0=np.eye(system.dimension)))
-    found = _kept(_Structure.of(plain, how, errors))
-    batch = _Batch(system, found, errors)
+    found = _kept(_StructureKey.of(plain, how, errors))
+    batch = _ItemStack(system, found, errors)
     # items with the same noises side by side, so that a block of them has few different ones
     order = np.argsort(noises.different()[1], kind="stable")
     size = max(1, BLOCK // (len(found.made.estimator.ledger.sums) * batch.numbers))
@@ -660,7 +660,7 @@ def _over_items(system: System, link: np.ndarray, items: Items, how: Settings, e
     )
 
 
-class _Batch(NamedTuple):
+class _ItemStack(NamedTuple):
     """Items with noises of their own, side by side."""
 
     system: System

@@ -20,14 +20,14 @@ from stochfuse.scenario.registry import LFG, OPTIMUM
 
 if TYPE_CHECKING:
     from stochfuse.prediction.general import Outcomes
-    from stochfuse.prediction.sampled import Sampled
+    from stochfuse.prediction.sampled import MomentSample
 
 MOST_GRAPHS = 100_000
 RUNS, SEED = 1000, 1
 
 
 @dataclass(frozen=True)
-class Shown:
+class ShownPart:
     """What of a prediction will be looked at: what a precision is asked of.
 
     Parameters
@@ -77,7 +77,7 @@ class Settings:
     precision: float | str | None = None
     at_most: float | str | None = None
     exact_first: bool = True
-    shown: Shown = Shown()
+    shown: ShownPart = ShownPart()
 
 
 class Averaged(NamedTuple):
@@ -106,7 +106,7 @@ class Averaged(NamedTuple):
     notes: tuple[str, ...] = ()
     forms: tuple[str, ...] = ()
     outcomes: Outcomes | None = None
-    sampled: Sampled | None = None
+    sampled: MomentSample | None = None
     meta: Mapping[str, Any] = MappingProxyType({})
 
 

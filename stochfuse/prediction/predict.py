@@ -22,7 +22,7 @@ from stochfuse.engines.precision import told
 from stochfuse.errors import NoAnswerError, StochfuseError, TooManyError, UsageError, nearest
 from stochfuse.kalman.checks import covariance_fault
 from stochfuse.kalman.metrics import metric as metric_of
-from stochfuse.prediction.method import RUNS, Averaged, Settings, Shown, faults_of, seconds, share
+from stochfuse.prediction.method import RUNS, Averaged, Settings, ShownPart, faults_of, seconds, share
 from stochfuse.prediction.quantities import QUANTITIES
 from stochfuse.prediction.result import Prediction
 from stochfuse.prediction.swept import Swept, of_parts
@@ -259,7 +259,7 @@ def predict_several(
     for some in (together, apart):
         if some:
             hardest = max(some, key=HARDNESS.index)
-            shown = replace(settings.get("shown", Shown()), quantities=tuple(some))
+            shown = replace(settings.get("shown", ShownPart()), quantities=tuple(some))
             common = predict(scenario, link, method, hardest, **{**settings, "shown": shown})
             found |= {q: common if q == hardest else common.shown_as(q) for q in some}
     return [found[q] for q in quantities]

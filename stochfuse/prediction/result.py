@@ -20,7 +20,7 @@ from stochfuse.scenario.system import Noises
 if TYPE_CHECKING:
     from stochfuse.prediction.general import Outcomes
     from stochfuse.prediction.interval import Posterior
-    from stochfuse.prediction.sampled import Sampled
+    from stochfuse.prediction.sampled import MomentSample
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -64,7 +64,7 @@ class Prediction(Result):
     notes: tuple[str, ...] = ()
     estimator: str = BROADCAST_PRIOR
     outcomes: Outcomes | None = field(default=None, repr=False)
-    sampled: Sampled | None = field(default=None, repr=False)
+    sampled: MomentSample | None = field(default=None, repr=False)
     meta: Mapping[str, Any] = field(default_factory=dict)
     limit: Limit | None = None
     supported: tuple[Posterior, Prediction] | None = field(default=None, repr=False)

@@ -38,14 +38,14 @@ from stochfuse.prediction.control import (
     MOST_HELD,
     WORTH,
     Control,
-    Expected,
+    ControlExpectation,
     Followed,
     coefficients,
     estimated,
     no_control,
 )
 from stochfuse.prediction.general import groups_alike, spread
-from stochfuse.prediction.method import Averaged, Settings, Shown, group_of, joined, seconds, share
+from stochfuse.prediction.method import Averaged, Settings, ShownPart, group_of, joined, seconds, share
 from stochfuse.prediction.quantities import needed, value
 from stochfuse.prediction.stopping import FEWEST, FIRST, Parts, sampled_to
 from stochfuse.scenario.network import LinkRows
@@ -71,7 +71,7 @@ STEP = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
-class Sampled:
+class MomentSample:
     """A sample of claimed covariances, and of the moments of the actual error where they are asked for.
 
     Parameters
@@ -171,7 +171,7 @@ class Sampled:
         gap = float(np.abs(of(mean) - of(drawn.map(lambda m: m.mean(axis=0)))))
         return gap if gap > ROUNDING * np.abs(of(mean)) else 0.0
 
-    def shown(self, system: System, what: Shown) -> tuple[np.ndarray, np.ndarray]:
+    def shown(self, system: System, what: ShownPart) -> tuple[np.ndarray, np.ndarray]:
         """What will be looked at, and its standard errors, each (any,)."""
         metrics = what.metrics or (metric_of("trace", system.model),)
         everyone = range(len(self.groups))
@@ -245,7 +245,7 @@ def averaged(system: System, items: Items, how: Settings, errors: bool) -> Avera
 
 def sampled(
     system: System, links: LinkRows, how: Settings, *, errors: bool = False
-) -> tuple[Sampled, tuple[str, ...], dict[str, Any]]:
+) -> tuple[MomentSample, tuple[str, ...], dict[str, Any]]:
     """Draw a sample of an estimator's estimates; also what to say of it, to readers and to programs.
 
     Parameters
@@ -272,8 +272,8 @@ def sampled(
             return _extended(before, _optimum(optimum, system, len(links.link), now, first, errors))
         return _extended(before, _drawn(system, links, now, permutations, first=first, errors=errors))
 
-    def judge(drawn: Sample, parts: Parts) -> tuple[tuple[Sampled, str, Reduced], float]:
-        found = helped(system, links, how, Sampled(drawn, groups, odds), parts, shown, optimum)
+    def judge(drawn: Sample, parts: Parts) -> tuple[tuple[MomentSample, str, Reduced], float]:
+        found = helped(system, links, how, MomentSample(drawn, groups, odds), parts, shown, optimum)
         values, error = found[0].shown(system, shown)
         there = error > 0
         with np.errstate(divide="ignore"):  # no error but 0 is a share of 0
@@ -314,11 +314,11 @@ def helped(
     system: System,
     links: LinkRows,
     how: Settings,
-    plain: Sampled,
+    plain: MomentSample,
     parts: Parts,
-    shown: Shown,
+    shown: ShownPart,
     optimum: Followed,
-) -> tuple[Sampled, str, Reduced]:
+) -> tuple[MomentSample, str, Reduced]:
     """Correct a sample by the optimum, or what stands in for it, where that helps; also what to say of it."""
     how = replace(how, runs=plain.runs)
     why = no_control(system, links, how)
@@ -329,7 +329,7 @@ def helped(
         return plain, "", Reduced()
     runs = optimum.in_runs(parts)
     # of an unknown expectation as if it were the sample's mean, to see whether further runs are worth their time
-    own = Expected(runs.map(lambda m: m.mean(axis=1)), np.zeros(plain.odds.shape[:2]))
+    own = ControlExpectation(runs.map(lambda m: m.mean(axis=1)), np.zeros(plain.odds.shape[:2]))
     found = replace(plain, control=Control(runs, expected or own))
     reduction = _reduction(plain, found, system, shown)
     if expected is None and reduction >= WORTH:
@@ -352,7 +352,7 @@ def helped(
     )
 
 
-def _reduction(plain: Sampled, found: Sampled, system: System, shown: Shown) -> float:
+def _reduction(plain: MomentSample, found: MomentSample, system: System, shown: ShownPart) -> float:
     """Variance of what is shown, relative to its values, without a control over that with it; 0 of none."""
     (values, error), (_, less) = plain.shown(system, shown), found.shown(system, shown)
     there = (error > 0) & (values != 0)
@@ -377,7 +377,7 @@ def _odds(system: System, links: LinkRows, groups: Sequence[tuple[int, ...]], es
     return np.where(likeliest < 1.0, 1.0 - likeliest, 0.0)
 
 
-def rare(system: System, links: LinkRows, found: Sampled) -> list[str]:
+def rare(system: System, links: LinkRows, found: MomentSample) -> list[str]:
     """What to say of steps at which nearly all runs met one value: what is rarer than they are many may be missing."""
     said, claimed = [], Moments(found.sample.values.P)
     for row, µ in enumerate(links.means(system.network)):

@@ -153,12 +153,12 @@ def critical(
     if not numbered and agent not in ("mean", "worst", "best"):
         raise UsageError(f"agent: expected mean, worst, best or a number from 1 to {agents}, got {agent!r}")
     if parameter is None:
-        at = _Links(scenario).at
+        at = _ReceiverChances(scenario).at
     else:
         sweep = parameter
         at = lambda x: _of(sweep(x), None)  # noqa: E731
     receivers = [r for r, _ in at(0.5) if not numbered or agent in r]
-    asked = [_Asked(at, name, [r]) for r in receivers] if agent == "best" else [_Asked(at, name, receivers)]
+    asked = [_BoundSearch(at, name, [r]) for r in receivers] if agent == "best" else [_BoundSearch(at, name, receivers)]
     found, lost = [], []
     for one in asked:
         try:
@@ -195,7 +195,7 @@ class _Bracket(NamedTuple):
         return _Bracket(middle, nearest.worst, low.low, high.high, low.growing, high.bounded)
 
 
-class _Links:
+class _ReceiverChances:
     """The receivers of a scenario at any probability of all its links."""
 
     def __init__(self, scenario: Scenario):
@@ -235,7 +235,7 @@ def _of(scenario: Scenario, rows: LinkRows | None) -> list[_Receiver]:
     return found
 
 
-class _Asked:
+class _BoundSearch:
     """The search for the value from which on the recursions of some receivers are all bounded."""
 
     def __init__(self, at: Callable[[float], list[_Receiver]], name: str, receivers: Sequence[tuple[int, ...]]):

@@ -111,7 +111,7 @@ def least_value(
     if key == STEPS and asked.get("step") is not None:
         raise UsageError(f"step: expected none with over {STEPS}, whose last step is asked about")
     about = question(scenario, one_link=False, **asked)
-    E = _Numbers(about, key, link)
+    E = _Objective(about, key, link)
     whole = _takes_whole_numbers_only(about.scenario, key, low, high)
     grid = _grid(low, high, whole)
     values = E.at(grid)
@@ -152,7 +152,7 @@ def _range(key: str, between: Sequence[float]) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class _Numbers:
+class _Objective:
     """E(v): the number asked about, where a key is v."""
 
     asked: Question

@@ -24,7 +24,7 @@ from math import comb
 
 import numpy as np
 
-from stochfuse.engines.events import Event, concerning
+from stochfuse.engines.events import ChanceEvent, concerning
 from stochfuse.errors import UsageError
 from stochfuse.kalman.arrivals import poisson_binomial
 from stochfuse.scenario.network import LinkRows, Network, number_of_senders, possible_senders
@@ -61,7 +61,7 @@ def like_agents(network: Network, rows: LinkRows, aside: int | None = None) -> l
     return groups
 
 
-def naive_load(network: Network, rows: LinkRows, drawn: list[list[Event]], agent: int) -> np.ndarray:
+def naive_load(network: Network, rows: LinkRows, drawn: list[list[ChanceEvent]], agent: int) -> np.ndarray:
     """Distribution of the number of arrivals, (rows, steps, sizes)."""
     out = np.zeros((len(rows.link), len(drawn), number_of_senders(network.architecture, network.agents) + 1))
     for k, now in enumerate(drawn if rows.varies else drawn[:1]):
@@ -71,7 +71,7 @@ def naive_load(network: Network, rows: LinkRows, drawn: list[list[Event]], agent
     return out
 
 
-def walked_load(network: Network, rows: LinkRows, drawn: list[list[Event]], agent: int) -> np.ndarray:
+def walked_load(network: Network, rows: LinkRows, drawn: list[list[ChanceEvent]], agent: int) -> np.ndarray:
     """Distribution of the load by the backward walk, (rows, steps, sizes)."""
     walk = _Walk(agent, like_agents(network, rows, agent), drawn if rows.varies else drawn[:1], len(rows.link))
     largest = (network.agents - 1) * network.steps
@@ -92,7 +92,7 @@ class _Walk:
     rows : number of rows.
     """
 
-    def __init__(self, agent: int, classes: list[list[int]], drawn: list[list[Event]], rows: int) -> None:
+    def __init__(self, agent: int, classes: list[list[int]], drawn: list[list[ChanceEvent]], rows: int) -> None:
         self.agent, self.classes, self.rows, self.drawn = agent, classes, rows, len(drawn)
         self._check(max((comb(len(members) + 2, 2) for members in classes), default=1))
         # per step and sender: whom each event reaches, and the probability that it fails
@@ -220,7 +220,7 @@ BLOCK = 250
 """Runs drawn from one seed."""
 
 
-def sampled_loads(agents: int, drawn: Sequence[Sequence[Event]], rows: int, runs: int, seed: int) -> np.ndarray:
+def sampled_loads(agents: int, drawn: Sequence[Sequence[ChanceEvent]], rows: int, runs: int, seed: int) -> np.ndarray:
     """Loads of simulated agents, (rows, runs, steps, agents); all rows are drawn from the same random numbers."""
     numbers = max(rows * runs * len(drawn) * agents, rows * min(runs, BLOCK) * agents**2)
     if numbers > MOST_NUMBERS:
@@ -242,7 +242,7 @@ def sampled_loads(agents: int, drawn: Sequence[Sequence[Event]], rows: int, runs
 
 
 def _simulated(
-    agents: int, drawn: Sequence[Sequence[Event]], rows: int, runs: int, generator: np.random.Generator
+    agents: int, drawn: Sequence[Sequence[ChanceEvent]], rows: int, runs: int, generator: np.random.Generator
 ) -> np.ndarray:
     """Follow the latest node of every agent that every agent knows, (rows, runs, agent, of agent); 0: none."""
     known = np.zeros((rows, runs, agents, agents), dtype=np.int32)

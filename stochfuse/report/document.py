@@ -68,7 +68,7 @@ footer { margin-top: 2rem; color: #555; font-size: .85rem; }
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
 
-class Told(NamedTuple):
+class DocumentNote(NamedTuple):
     """What is told with a result.
 
     Parameters
@@ -83,7 +83,7 @@ class Told(NamedTuple):
     said: Sequence[str] = ()
 
 
-def document(report: Report, told: Told) -> str:
+def document(report: Report, told: DocumentNote) -> str:
     """Return a result as a page of HTML.
 
     Parameters
@@ -160,7 +160,7 @@ def _words(tables: Sequence[Table], asked: Sequence[str]) -> str:
     return f"<dl>{listed}</dl>" if found else ""
 
 
-def _again(told: Told) -> str:
+def _again(told: DocumentNote) -> str:
     """The command that does it again."""
     text = f"<pre>{escape(shlex.join(('stochfuse', *told.words)))}</pre>"
     if "-" in told.words:

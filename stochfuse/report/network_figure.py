@@ -28,7 +28,7 @@ SIZE, FAR = 9.0, 9.0
 LEADER = {"arrowstyle": "-", "linewidth": 0.5, "color": "0.3", "shrinkA": 0, "shrinkB": 4}
 
 
-class _Panel(NamedTuple):
+class _NetworkPanel(NamedTuple):
     title: str
     step: int
     link: np.ndarray
@@ -91,12 +91,14 @@ def draw_network(found: Links, steps: Sequence[int]) -> Any:
     return figure
 
 
-def _panels(found: Links, steps: Sequence[int]) -> Iterator[_Panel]:
+def _panels(found: Links, steps: Sequence[int]) -> Iterator[_NetworkPanel]:
     for name, link in found.cases or [("", found.link)]:
         varies = link.ndim == 3 or found.moves
         for step in steps if varies else (1,):
             title = ", ".join(part for part in (name, f"step {step}" if varies else "") if part)
-            yield _Panel(title, step, np.nan_to_num(link[step - 1] if link.ndim == 3 else link), _places(found, step))
+            yield _NetworkPanel(
+                title, step, np.nan_to_num(link[step - 1] if link.ndim == 3 else link), _places(found, step)
+            )
 
 
 def _places(found: Links, step: int) -> np.ndarray:
@@ -145,7 +147,7 @@ def _ink(µ: float) -> dict[str, Any]:
     return {"color": str(round(0.82 * (1.0 - µ), 3)), "linewidth": 0.4 + 2.2 * µ}
 
 
-def _draw_panel(axes: Any, panel: _Panel, found: Links) -> list[_Arc]:
+def _draw_panel(axes: Any, panel: _NetworkPanel, found: Links) -> list[_Arc]:
     from matplotlib.collections import LineCollection
 
     for place in found.places:
@@ -175,7 +177,7 @@ def _draw_panel(axes: Any, panel: _Panel, found: Links) -> list[_Arc]:
     return arcs
 
 
-def _arcs(panel: _Panel) -> list[_Arc]:
+def _arcs(panel: _NetworkPanel) -> list[_Arc]:
     """Links as arcs from sender to receiver; one for both ways where all are alike."""
     arcs, t = [], np.linspace(0.0, 1.0, POINTS)[:, None]
     for i, j in np.argwhere(panel.link >= LEAST):
@@ -189,7 +191,7 @@ def _arcs(panel: _Panel) -> list[_Arc]:
     return arcs
 
 
-def _labels(found: Links, panel: _Panel) -> list[str]:
+def _labels(found: Links, panel: _NetworkPanel) -> list[str]:
     """Names, with the heights where places have some."""
     if not any(place.shape[-1] == 3 for place in found.places):
         return list(found.nodes)
@@ -197,7 +199,7 @@ def _labels(found: Links, panel: _Panel) -> list[str]:
     return [f"{name} ({z:g} m up)" for name, z in zip(found.nodes, heights, strict=True)]
 
 
-def _name(axes: Any, panel: _Panel, arcs: Sequence[_Arc], found: Links) -> None:
+def _name(axes: Any, panel: _NetworkPanel, arcs: Sequence[_Arc], found: Links) -> None:
     """Write the agents' names beside their places, where they cover least of links, ways, agents and other names."""
     from matplotlib.patheffects import withStroke
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from stochfuse import __version__
-from stochfuse.data.protocols import ProtocolLoad, Sampled
+from stochfuse.data.protocols import ProtocolLoad, SampledLoad
 from stochfuse.kalman.metrics import Metric
 from stochfuse.prediction import quantities
 from stochfuse.report.plot import COLORS, MARKERS, below, figure_class, titled
@@ -49,7 +49,7 @@ class ProtocolView:
         """What the rows stand for."""
         return ResultRows(self.found)
 
-    def accuracy(self, protocol: int) -> Sampled | None:
+    def accuracy(self, protocol: int) -> SampledLoad | None:
         """Of a protocol, where it is asked for."""
         return None if self.metric is None else self.found.accuracy(protocol, self.metric, self.quantity, self.agent)
 
@@ -96,7 +96,7 @@ def _table(view: ProtocolView) -> Table:
     return Table(view.titles, (*view.rows.keys, "protocol"), columns, tuple(rows))
 
 
-def _cell(shown: Sampled, row: int, digits: int) -> str:
+def _cell(shown: SampledLoad, row: int, digits: int) -> str:
     value, error = shown.values[row], shown.error[row]
     return "0" if not value and not error else f"{number(value, digits)} ±{error:.2g}"
 

@@ -46,7 +46,7 @@ class Relations(NamedTuple):
     pairs: dict[tuple[int, int], Relation]
 
 
-class _Noise(NamedTuple):
+class _RelationNoise(NamedTuple):
     range: float | None
     direction: float | None
     time: float | None
@@ -59,7 +59,7 @@ class _Noise(NamedTuple):
         return "range" if self.direction is None else "both"
 
 
-class _States(NamedTuple):
+class _StateIndices(NamedTuple):
     """Indices of the states that are the place, the attitude and the clock of an agent, and how many states it has."""
 
     positions: tuple[int, ...]
@@ -101,7 +101,7 @@ def read_cooperative(
     where = _states(check, table, states, list(noises.values()))
     if where is None:
         return None
-    if noises and not any(isinstance(noise, _Noise) and noise.kind for noise in noises.values()):
+    if noises and not any(isinstance(noise, _RelationNoise) and noise.kind for noise in noises.values()):
         return Relations((), {pair: _related(noise, where, None, None) for pair, noise in noises.items()})
     places = _places(check, nodes, len(where.positions), agents, steps)
     if places is None:
@@ -110,10 +110,10 @@ def read_cooperative(
 
 
 def _states(
-    check: Checker, table: Mapping[str, Any], states: Sequence[str], related: Sequence[_Noise | Relation]
-) -> _States | None:
+    check: Checker, table: Mapping[str, Any], states: Sequence[str], related: Sequence[_RelationNoise | Relation]
+) -> _StateIndices | None:
     """States by their names; None where one that is needed is not there."""
-    before, measured = len(check.problems), [noise for noise in related if isinstance(noise, _Noise)]
+    before, measured = len(check.problems), [noise for noise in related if isinstance(noise, _RelationNoise)]
     place: tuple[int, ...] = ()
     if table.get("positions") is not None or any(noise.kind for noise in measured) or not related:
         expected = "the names of the 2 or 3 states that are the place"
@@ -131,7 +131,7 @@ def _states(
         clock = _named(check, one, "clock", states, (1,), "the name of the state that is the clock's error")
         if not any(noise.time for noise in measured) and table.get("time") is None:
             check.note("cooperative.clock", "a time that is measured", "none")
-    return None if len(check.problems) > before else _States(place, turned, clock, len(states))
+    return None if len(check.problems) > before else _StateIndices(place, turned, clock, len(states))
 
 
 def _named(
@@ -146,7 +146,9 @@ def _named(
     return () if None in known else tuple(states.index(name) for name in names)
 
 
-def _noises(check: Checker, table: Mapping[str, Any], agents: int, d: int) -> dict[tuple[int, int], _Noise | Relation]:
+def _noises(
+    check: Checker, table: Mapping[str, Any], agents: int, d: int
+) -> dict[tuple[int, int], _RelationNoise | Relation]:
     """Return what each ordered pair measures; pairs that measure nothing are left out."""
     if not _measures(table) and not table.get("pair"):
         expected = "a standard deviation here, in cooperative.direction or in [[cooperative.pair]]"
@@ -175,10 +177,10 @@ def _listed(value: Any) -> Sequence[Any]:
 
 
 def _measures(table: Mapping[str, Any]) -> bool:
-    return any(table.get(key) is not None for key in _Noise._fields)
+    return any(table.get(key) is not None for key in _RelationNoise._fields)
 
 
-def _pair_noise(check: Checker, path: str, pair: Mapping[str, Any], d: int) -> _Noise | Relation | None:
+def _pair_noise(check: Checker, path: str, pair: Mapping[str, Any], d: int) -> _RelationNoise | Relation | None:
     matrices = [pair.get(key) for key in Relation._fields]
     if any(M is not None for M in matrices):
         return _linear(check, path, pair, d)
@@ -216,8 +218,8 @@ def _linear(check: Checker, path: str, pair: Mapping[str, Any], d: int) -> Relat
         return None
 
 
-def _noise(check: Checker, path: str, table: Mapping[str, Any]) -> _Noise | None:
-    noise = _Noise(*(_deviation(check, f"{path}.{key}", table.get(key)) for key in _Noise._fields))
+def _noise(check: Checker, path: str, table: Mapping[str, Any]) -> _RelationNoise | None:
+    noise = _RelationNoise(*(_deviation(check, f"{path}.{key}", table.get(key)) for key in _RelationNoise._fields))
     return noise if any(sigma is not None for sigma in noise) else None
 
 
@@ -269,9 +271,9 @@ def _places(check: Checker, nodes: list[Any], coordinates: int, agents: int, ste
 
 def _relations(
     check: Checker,
-    noises: Mapping[tuple[int, int], _Noise | Relation],
+    noises: Mapping[tuple[int, int], _RelationNoise | Relation],
     places: Sequence[np.ndarray],
-    where: _States,
+    where: _StateIndices,
 ) -> dict[tuple[int, int], Relation]:
     related, refused = {}, set()
     for (i, j), noise in noises.items():
@@ -293,7 +295,7 @@ def _relations(
     return related
 
 
-def _related(noise: _Noise | Relation, where: _States, r_i: Any, r_j: Any) -> Relation:
+def _related(noise: _RelationNoise | Relation, where: _StateIndices, r_i: Any, r_j: Any) -> Relation:
     """What a pair measures, over its full states."""
     if isinstance(noise, Relation):
         return noise

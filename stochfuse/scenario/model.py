@@ -82,7 +82,7 @@ class Filter:
 
 
 @dataclass(frozen=True, eq=False)
-class Noise:
+class NoiseCorrelation:
     """How the agents' measurement noises hang together.
 
     Parameters

@@ -33,7 +33,7 @@ from stochfuse.fusion.cooperative import Relation
 from stochfuse.kalman.checks import shown
 from stochfuse.kalman.metrics import metric as metric_of
 from stochfuse.scenario.checker import Checker
-from stochfuse.scenario.model import Filter, Model, Noise, Sensor
+from stochfuse.scenario.model import Filter, Model, NoiseCorrelation, Sensor
 from stochfuse.scenario.network import LinkRows, Network, default_rows, restricted, stacked_rows, uniform_rows
 from stochfuse.scenario.registry import ESTIMATORS, GENERAL, METHODS, MONTE_CARLO
 from stochfuse.scenario.sensing import Instrument, by_name, is_named, read_named
@@ -89,7 +89,7 @@ class Scenario:
     source: Mapping[str, Any]
     own: bool = False
     filters: tuple[Filter, ...] = ()
-    noise: Noise | None = None
+    noise: NoiseCorrelation | None = None
     process: np.ndarray | None = None
     relations: Mapping[tuple[int, int], Relation] = field(default_factory=dict)
     agent: int | None = None

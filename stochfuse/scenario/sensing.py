@@ -335,7 +335,7 @@ def sometimes(check: Checker, path: str, table: Any, sensor: Sensor, steps: int)
     return replace(sensor, H=H, detection=sensor.detection if "detection" not in table else detection)
 
 
-class _Given(NamedTuple):
+class _SensingContext(NamedTuple):
     """What sensors are read beside.
 
     Parameters
@@ -407,7 +407,7 @@ def read_named(
         return Named(dict.fromkeys([0, *named]))
     layout, steps = layout_of(table.get("kind"), model.states), network.steps
     course = read_course(check, table, layout, model, steps)
-    given = _Given(layout, course, model, steps, table.get("nominal") is not None, own)
+    given = _SensingContext(layout, course, model, steps, table.get("nominal") is not None, own)
     default = None
     if common:
         _refuse(check, "model", table, ("H", "R"), "nothing beside a sensor by name")
@@ -444,7 +444,7 @@ def _refuse(check: Checker, path: str, table: Mapping[str, Any], keys: Sequence[
             check.note(f"{path}.{key}", expected, shown(table[key]))
 
 
-def _read(check: Checker, path: str, table: Mapping[str, Any], given: _Given) -> _Read | None:
+def _read(check: Checker, path: str, table: Mapping[str, Any], given: _SensingContext) -> _Read | None:
     """Read one sensor's table."""
     if table.get("kind") is None:
         expected = "one of " + ", ".join(f'"{known}"' for known in KINDS)
@@ -476,7 +476,7 @@ def _read(check: Checker, path: str, table: Mapping[str, Any], given: _Given) ->
     return read
 
 
-def _fits(check: Checker, path: str, kind: str, given: _Given) -> bool:
+def _fits(check: Checker, path: str, kind: str, given: _SensingContext) -> bool:
     """Whether the model has the states that a kind is about; notes why not."""
     parts, layout = [PARTS[name] for name in KINDS[kind]], given.layout
     if layout is None:
@@ -552,7 +552,7 @@ def _detection(check: Checker, path: str, value: Any, steps: int) -> np.ndarray 
     return None if (detection == 1).all() else detection
 
 
-def _place(check: Checker, path: str, value: Any, given: _Given) -> np.ndarray | None:
+def _place(check: Checker, path: str, value: Any, given: _SensingContext) -> np.ndarray | None:
     """An agent's place as (steps, D); None where there is none, or where [cooperative] reads it."""
     if given.layout is None or given.own:
         return None
@@ -563,7 +563,9 @@ def _place(check: Checker, path: str, value: Any, given: _Given) -> np.ndarray |
     return place[: given.steps, :, 0] if place.ndim == 3 else np.broadcast_to(place[:, 0], (given.steps, axes))
 
 
-def _placed(check: Checker, path: str, position: Any, read: _Read, given: _Given) -> tuple[Sensor, Instrument] | None:
+def _placed(
+    check: Checker, path: str, position: Any, read: _Read, given: _SensingContext
+) -> tuple[Sensor, Instrument] | None:
     """Put a sensor at an agent's place; `path` is that of the agent's table, "agent" where there is none."""
     place = _place(check, path, position, given)
     if read.looks and position is None:

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from stochfuse.fusion.cooperative import Relation
-from stochfuse.scenario.model import Filter, Model, Noise, Sensor, over_steps
+from stochfuse.scenario.model import Filter, Model, NoiseCorrelation, Sensor, over_steps
 from stochfuse.scenario.network import LinkRows, Network
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ class System:
     labels: tuple[int, ...]
     own: bool = False
     filters: tuple[Filter, ...] = ()
-    noise: Noise | None = None
+    noise: NoiseCorrelation | None = None
     process: np.ndarray | None = None
     relations: Mapping[tuple[int, int], Relation] = field(default_factory=dict)
 
@@ -246,7 +246,7 @@ def _labels(scenario: Scenario) -> tuple[int, ...]:
     return scenario.sensor_of if alike else tuple(range(scenario.network.agents))
 
 
-def _noise(scenario: Scenario) -> Noise | None:
+def _noise(scenario: Scenario) -> NoiseCorrelation | None:
     """How noises hang together, those of agents without a sensor independent of all others."""
     noise = scenario.noise
     widths = [scenario.sensors[kind].H.shape[-2] for kind in scenario.sensor_of]
@@ -254,7 +254,7 @@ def _noise(scenario: Scenario) -> Noise | None:
         return noise
     seeing = np.array(widths) > 0
     correlation = np.where(np.outer(seeing, seeing) | np.eye(len(widths), dtype=bool), noise.correlation, 0.0)
-    return Noise(correlation, None if noise.disturbance is None else _spread(noise.disturbance, widths))
+    return NoiseCorrelation(correlation, None if noise.disturbance is None else _spread(noise.disturbance, widths))
 
 
 def _spread(disturbance: np.ndarray, widths: Sequence[int]) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from stochfuse.kalman.checks import shown
 from stochfuse.scenario.checker import Checker
-from stochfuse.scenario.model import Filter, Model, Noise, Sensor
+from stochfuse.scenario.model import Filter, Model, NoiseCorrelation, Sensor
 from stochfuse.scenario.motion import read_motion, read_step, refuse_keys_of_kinds
 from stochfuse.scenario.network import ARCHITECTURES, Network, mean_delivery, possible_senders
 from stochfuse.scenario.radio import links_between, read_places, read_radio
@@ -469,7 +469,7 @@ def _own(check: Checker, path: str, value: Any, d: int, steps: int, default: np.
 
 def read_noise(
     check: Checker, table: Mapping[str, Any], sensors: Sequence[Sensor], filters: Sequence[Filter], own: bool
-) -> tuple[Noise | None, np.ndarray | None]:
+) -> tuple[NoiseCorrelation | None, np.ndarray | None]:
     """Read [noise]: measurement noises that hang together, and the process noise of all parallel filters."""
     process = None
     if table.get("process") is not None:
@@ -483,7 +483,7 @@ def read_noise(
     sizes = [sensor.H.shape[-2] for sensor in sensors]
     correlation = _correlation(check, table.get("correlation"), sizes)
     disturbance = _disturbance(check, table.get("disturbance"), sizes)
-    return (None if correlation is None else Noise(correlation, disturbance)), process
+    return (None if correlation is None else NoiseCorrelation(correlation, disturbance)), process
 
 
 def _check_blocks(check: Checker, process: np.ndarray, own: Sequence[np.ndarray]) -> None:

@@ -17,7 +17,7 @@ from stochfuse.engines.precision import told
 from stochfuse.errors import NoAnswerError, ScenarioError, StochfuseError, TooManyError
 from stochfuse.kalman.checks import LARGEST, covariance_fault, first_fault
 from stochfuse.prediction.compare import OF_SAMPLES
-from stochfuse.prediction.method import Shown
+from stochfuse.prediction.method import ShownPart
 from stochfuse.prediction.predict import WORTHLESS, predict_items, predict_several
 from stochfuse.prediction.result import Prediction
 from stochfuse.questions.messages import message_load
@@ -307,7 +307,7 @@ def _several(asked: _Points, scenario: Scenario, items: np.ndarray) -> bool:
         # what the optimum claims is the optimum
         names = [OPTIMAL if asked.method == OPTIMAL and q == "claimed" else q for q in asked.quantities]
         different = list(dict.fromkeys(names))
-        shown = Shown(metrics=tuple(map(asked.plan.metric, asked.plan.metrics)), agent=asked.plan.agent)
+        shown = ShownPart(metrics=tuple(map(asked.plan.metric, asked.plan.metrics)), agent=asked.plan.agent)
         several = predict_several(scenario, links, asked.method, different, **{**asked.settings, "shown": shown})
         found = [several[different.index(name)] for name in names]
         _fill(asked, found, items, rows)

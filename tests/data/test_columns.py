@@ -13,17 +13,17 @@ import numpy as np
 import pytest
 
 from stochfuse.data import columns, tables
-from stochfuse.data.columns import LABEL, NUMBER, TEXT, WHOLE, ColumnsError, Field, read_chunks, read_columns
+from stochfuse.data.columns import LABEL, NUMBER, TEXT, WHOLE, ColumnField, ColumnsError, read_chunks, read_columns
 from stochfuse.errors import StochfuseError
 
 FIELDS = (
-    Field("run", LABEL),
-    Field("agent", TEXT),
-    Field("step", WHOLE, 1),
-    Field("z1"),
-    Field("note", TEXT, required=False, blank=True),
-    Field("nees", NUMBER, 0, required=False, blank=True),
-    Field("P", free=True, required=False),
+    ColumnField("run", LABEL),
+    ColumnField("agent", TEXT),
+    ColumnField("step", WHOLE, 1),
+    ColumnField("z1"),
+    ColumnField("note", TEXT, required=False, blank=True),
+    ColumnField("nees", NUMBER, 0, required=False, blank=True),
+    ColumnField("P", free=True, required=False),
 )
 
 
@@ -114,7 +114,7 @@ def test_places_in_tables_that_are_no_text(tmp_path):
     pandas, pa, pq = (pytest.importorskip(m) for m in ("pandas", "pyarrow", "pyarrow.parquet"))
     made = {"step": [1, 2, 0]}
     pq.write_table(pa.table(made), tmp_path / "t.parquet")
-    wanted = (Field("step", WHOLE, 1),)
+    wanted = (ColumnField("step", WHOLE, 1),)
     for source, where in (
         (tmp_path / "t.parquet", r"t\.parquet, record 3"),
         (written(tmp_path, json.dumps(made), "t.json"), r"t\.json, record 3"),
@@ -173,24 +173,26 @@ def test_memory_does_not_grow_with_the_file(tmp_path, parser, monkeypatch):
 
 def test_renamed(tmp_path, parser):
     path = written(tmp_path, "k,Who,z1,y\n1,a,2,3\n")
-    found = read_columns(path, [Field("step", WHOLE), Field("agent", TEXT), Field("z1")], {"step": "K", "agent": "Who", "z1": "y"})  # fmt: skip
+    found = read_columns(path, [ColumnField("step", WHOLE), ColumnField("agent", TEXT), ColumnField("z1")], {"step": "K", "agent": "Who", "z1": "y"})  # fmt: skip
     assert plain(found) == {"step": [1], "agent": ["a"], "z1": [3.0]}
     assert found.skipped == ("z1",)
     with pytest.raises(ColumnsError, match=r"t\.csv: no column 'Wo' \(did you mean 'Who'\?\), to be used as 'agent'; the columns are k, Who, z1, y"):  # fmt: skip
-        read_columns(path, [Field("agent", TEXT)], {"agent": "Wo"})
+        read_columns(path, [ColumnField("agent", TEXT)], {"agent": "Wo"})
     with pytest.raises(ColumnsError, match=r"columns: unknown column 'stop' \(did you mean 'step'\?\); expected step"):
-        read_columns(path, [Field("step", WHOLE)], {"stop": "k"})
+        read_columns(path, [ColumnField("step", WHOLE)], {"stop": "k"})
 
 
 def test_fields_may_depend_on_the_headings(tmp_path):
     path = written(tmp_path, "step,z1,z2,other\n1,2,3,4\n")
-    found = read_columns(path, lambda names: [Field("step", WHOLE), *(Field(n) for n in names if n.startswith("z"))])
+    found = read_columns(
+        path, lambda names: [ColumnField("step", WHOLE), *(ColumnField(n) for n in names if n.startswith("z"))]
+    )
     assert plain(found) == {"step": [1], "z1": [2.0], "z2": [3.0]}
 
 
 def test_resolution(tmp_path, parser):
     path = written(tmp_path, "a,b,c\n1.25,3,1e-3\n1.5,2,0.1\n")
-    found = read_columns(path, [Field(n) for n in "abc"])
+    found = read_columns(path, [ColumnField(n) for n in "abc"])
     assert [found.resolution(n) for n in "abc"] == [0.005, 0.5, 0.0]
 
 
@@ -250,7 +252,7 @@ def test_sources_that_are_none(tmp_path):
     with pytest.raises(ColumnsError, match="arrays, column 'a': expected an array of one axis, got ndarray"):
         read_columns({"a": np.ones((2, 2))}, FIELDS)
     with pytest.raises(ColumnsError, match="unknown column 'colour'; expected a"):
-        read_columns({"a": [1], "colour": [1]}, [Field("a")], others=False)
+        read_columns({"a": [1], "colour": [1]}, [ColumnField("a")], others=False)
 
 
 def test_parquet_that_is_none(tmp_path, monkeypatch):

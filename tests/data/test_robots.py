@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import stochfuse as sf
-from stochfuse.data.robot_errors import Channel, Noises, Process, identify
-from stochfuse.data.robot_filters import ESTIMATORS, Expected, Followed, _intersected, assumed, course, filtered
+from stochfuse.data.robot_errors import Channel, ChannelNoises, Process, identify
+from stochfuse.data.robot_filters import ESTIMATORS, Followed, RobotMoments, _intersected, assumed, course, filtered
 from stochfuse.data.robots import moved, read_robots, seen
 from stochfuse.errors import UsageError
 from stochfuse.fusion.extended import jacobian
@@ -140,7 +140,7 @@ def test_intersection_in_bulk_is_the_intersection():
         assert pytest.approx(stack.gains[1], abs=0.03) == K
 
 
-class Dense(Expected):
+class Dense(RobotMoments):
     """The same moments by one dense joint covariance of errors and biases, every matrix written out."""
 
     def __init__(self, course, noises, path, items):
@@ -195,7 +195,7 @@ def test_moments_are_those_of_the_dense_joint_covariance(estimator, record):
         part = one * size**2
         return Channel(0 * one, 0.1 * part, Process(part, 1.5), Process(0.5 * part, 3.0), 0.2 * part, one * 2, one)
 
-    noises = Noises(channel(0.1), channel(0.2), channel(0.05), channel(0.01), 0.0, 0.0)
+    noises = ChannelNoises(channel(0.1), channel(0.2), channel(0.05), channel(0.01), 0.0, 0.0)
     course_ = course(record, noises)
     heard = np.random.default_rng(0).random((2, course_.pairs, 2)) < 0.6
     carried = Dense(course_, noises, record.truth, 2)

@@ -72,12 +72,12 @@ def test_a_change_takes_every_number_away_and_late_answers_are_dropped(page):
 
 def test_words_of_a_file_stay_words(page):
     from stochfuse.explore import answers
-    from stochfuse.explore.state import Given
+    from stochfuse.explore.state import OpenedScenario
 
     script = "<script>alert(1)</script>"
     mapping = {**page._given.mapping, "agent": [{"name": f"{script}{i}"} for i in range(3)]}
     mapping["model"] = {**mapping["model"], "states": [script]}
-    page.asked = page._begin(Given(f"{script}.toml", mapping))
+    page.asked = page._begin(OpenedScenario(f"{script}.toml", mapping))
     page._ask()
     for name, job in answers.quick(page.asked):
         page._answered(page._work, page._work.number, name, job())

@@ -13,9 +13,9 @@ import pytest
 import stochfuse as sf
 from stochfuse.errors import ScenarioError, StochfuseError, UsageError
 from stochfuse.explore import answers
-from stochfuse.explore.answers import Work
+from stochfuse.explore.answers import QuestionWorker
 from stochfuse.explore.network import picture
-from stochfuse.explore.state import Asked, begun, field_of, opened, preset, with_log
+from stochfuse.explore.state import PageInput, begun, field_of, opened, preset, with_log
 from stochfuse.scenario.as_toml import to_toml
 from tests.cli.command import run, strict_json
 
@@ -23,7 +23,7 @@ EDGES = b"receiver,sender,link\na,b,0.3\nb,a,0.6\n"
 
 
 def asked(name="thesis-transient", **changed):
-    return Asked(preset(name), **changed)
+    return PageInput(preset(name), **changed)
 
 
 def answer(question, name):
@@ -125,7 +125,7 @@ def test_opened_files_are_content_alone(tmp_path):
         with pytest.raises(ScenarioError, match=r"network\.link\.file: expected one that was opened here before"):
             opened("x.toml", text.replace(b"e.csv", file.encode()), {"e.csv": EDGES})
     assert opened("e.csv", EDGES, {}) is None
-    assert Asked(with_log(preset("thesis-steady"), "e.csv", {"e.csv": EDGES})).scenario.network.agents == 2
+    assert PageInput(with_log(preset("thesis-steady"), "e.csv", {"e.csv": EDGES})).scenario.network.agents == 2
 
 
 @pytest.mark.parametrize(
@@ -152,7 +152,7 @@ def test_a_scenario_of_the_command_line_does_not_reach_out_of_its_folder(tmp_pat
     with pytest.raises(ScenarioError, match=r"network\.link\.file: expected a file within .*/in, got '\.\./e\.csv'"):
         begun(str(tmp_path / "in" / "s.toml"))
     (tmp_path / "s.toml").write_text(text.replace("../", ""))
-    assert Asked(begun(str(tmp_path / "s.toml"))).scenario.network.agents == 2
+    assert PageInput(begun(str(tmp_path / "s.toml"))).scenario.network.agents == 2
 
 
 @pytest.mark.parametrize(
@@ -190,7 +190,7 @@ def test_what_is_no_longer_asked_is_given_up_and_never_handed_on():
         if name == "done":
             over.set()
 
-    work = Work(deliver)
+    work = QuestionWorker(deliver)
     first = work.ask(asked(agents=8, link=0.5))  # takes a minute
     time.sleep(0.3)
     second = work.ask(asked(steps=2, link=0.5))
@@ -216,7 +216,7 @@ def test_what_is_no_longer_asked_is_given_up_and_never_handed_on():
 
 def test_a_refusal_is_an_answer():
     heard = []
-    work = Work(lambda number, name, found: heard.append((name, found)))
+    work = QuestionWorker(lambda number, name, found: heard.append((name, found)))
     work.number = 1
     work._follow(1, asked("beacon-map", link=0.5, estimators=()))
     assert "expected agents that track one state" in str(dict(heard)["simplified"])

@@ -13,7 +13,7 @@ from stochfuse.engines.events import events
 from stochfuse.engines.monte_carlo import Sample, draw_fates, stream
 from stochfuse.kalman.metrics import metric
 from stochfuse.prediction import control
-from stochfuse.prediction.method import Shown
+from stochfuse.prediction.method import ShownPart
 from stochfuse.scenario.scenario import link_rows
 from tests.agreement.test_detection import with_detection
 
@@ -111,7 +111,9 @@ def test_it_is_unbiased_and_its_error_is_honest(case):
     runs = 800 if case in ("graph", "burst", "detections") else 400
     scenario, link, estimator = CASES[case]
     exact = sf.predict(scenario, link, "general", "rms", estimator=estimator)
-    found = drawn(scenario, link, quantity="rms", estimator=estimator, runs=400 * runs, shown=Shown(("claimed", "rms")))
+    found = drawn(
+        scenario, link, quantity="rms", estimator=estimator, runs=400 * runs, shown=ShownPart(("claimed", "rms"))
+    )
     everyone, trace = range(len(found.sampled.groups)), metric("trace", scenario.model)
     for quantity in ("claimed", "actual", "bias") + ("consistency", "rms") * (case == "graph"):
         wanted = exact.shown_as(quantity).values()

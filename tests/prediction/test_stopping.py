@@ -11,7 +11,7 @@ from scipy.stats import chi2
 import stochfuse as sf
 from stochfuse.kalman.metrics import metric
 from stochfuse.prediction import stopping
-from stochfuse.prediction.method import Shown, seconds, share
+from stochfuse.prediction.method import ShownPart, seconds, share
 from tests.cli.command import run, strict_json
 
 
@@ -65,7 +65,7 @@ def test_every_error_shown_is_below_its_share():
     )
     for given, link, settings, agent in (
         (scenario, [0.2, 0.6], {"estimator": "naive", "quantity": "actual"}, "mean"),
-        (agents, None, {"shown": Shown(metrics=(metric("std:x", agents.model),), agent=2)}, 2),
+        (agents, None, {"shown": ShownPart(metrics=(metric("std:x", agents.model),), agent=2)}, 2),
     ):
         for control in ("optimum", "none"):
             p = sf.predict(given, link, "monte-carlo", control=control, **{**asked, **settings})

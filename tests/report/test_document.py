@@ -12,7 +12,7 @@ from html.parser import HTMLParser
 import pytest
 
 import stochfuse as sf
-from stochfuse.report.document import Told, document
+from stochfuse.report.document import DocumentNote, document
 from stochfuse.report.results import report_of
 from stochfuse.scenario.as_toml import to_toml
 from stochfuse.scenario.scenario import preset_names
@@ -170,13 +170,13 @@ def test_what_cannot_be_written_is_said_before_any_work(name, message, tmp_path)
 
 def test_without_matplotlib_the_page_says_why_there_is_no_figure(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    text = Page(document(report_of(sf.predict("thesis-transient", [0.5])), Told(("predict",), {}))).text
+    text = Page(document(report_of(sf.predict("thesis-transient", [0.5])), DocumentNote(("predict",), {}))).text
     assert "no figure: plots need matplotlib: pip install 'stochfuse[plot]'" in text
 
 
 def test_a_large_figure_is_drawn_in_dots(monkeypatch):
     monkeypatch.setattr("stochfuse.report.document.MOST_VECTORS", 100)
-    text = document(report_of(sf.predict("thesis-transient", [0.5])), Told(("predict",), {}))
+    text = document(report_of(sf.predict("thesis-transient", [0.5])), DocumentNote(("predict",), {}))
     assert 'src="data:image/png;base64,' in text
     assert "<svg" not in text
 
