@@ -102,18 +102,9 @@ def derive(
         from stochfuse.symbolic.general import derive_general
 
         estimator = NAIVE if formulation == NAIVE else LFG
-        form = derive_general(
-            agents,
-            step,
-            q,
-            r,
-            p0,
-            architecture=architecture,
-            correlation=correlation,
-            estimator=estimator,
-            quantity=quantity or QUANTITIES[0],
-            initial_error=initial_error,
-        )
+        start = correlation
+        form = derive_general(agents, step, q, r, p0, architecture=architecture, correlation=start, estimator=estimator)
+        form = form.showing(quantity or QUANTITIES[0], initial_error)
     made = derivation.derivation(form)
     if latex or format == LATEX:
         text = derivation.to_latex(made)

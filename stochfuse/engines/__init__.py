@@ -3,7 +3,7 @@
     mean_field      average after every step, then go on from the average
     enumeration     every outcome of which messages arrive; equal claims added up
     contact_chain   whose measurements an agent holds, walked backwards; `enclosure` where paths are too many
-    contact_sample  the optimum of outcomes drawn, by Boolean products
+    contact_sample  the optimum of outcomes drawn, by Boolean products; `heard` stands in for it as a control
     monte_carlo     outcomes drawn
 
 `events` has what may arrive in a step and how likely it is, `distribution` what can be asked of values with

@@ -67,10 +67,12 @@ class OptimumSample(NamedTuple):
     ----------
     P : (rows, runs, steps, agents, d, d) covariance, what the optimum claims and what it achieves.
     bias : (rows, runs, steps, agents, d, 1) what is left of the system's known initial error; None if there is none.
+    heard : (rows, runs, steps, agents) how many agents' data of the step are held right after its exchange.
     """
 
     P: np.ndarray
     bias: np.ndarray | None
+    heard: np.ndarray
 
     @property
     def mean(self) -> np.ndarray:
@@ -110,18 +112,22 @@ def sample_optimum(
     d, n, K, rows = system.dimension, system.agents, system.steps, len(links.link)
     P = np.empty((rows, runs, K, n, d, d))
     bias = None if system.error is None else np.empty((rows, runs, K, n, d, 1))
+    heard = np.empty((rows, runs, K, n), np.uint16)
     size = max(1, most_bytes // _bytes_of_a_run(system))
     blocks = blocks_of(runs, n, rows, first)
     outcomes = _ContactOutcomes(system, links, seed)
     work = _ContactWork(outcomes, _Riccati(system), system, size)
     if workers is None:
         workers = len(os.sched_getaffinity(0)) if rows * runs * sum(map(len, outcomes.events)) >= MANY else 1
-    for done, (row, start, now, left) in enumerate(_all_followed(work, blocks, min(workers, len(blocks))), start=1):
+    for done, (row, start, now, left, number) in enumerate(
+        _all_followed(work, blocks, min(workers, len(blocks))), start=1
+    ):
         P[row, start : start + len(now)] = now
         if bias is not None:
             bias[row, start : start + len(now)] = left
+        heard[row, start : start + len(now)] = number
         listener().advance("sampling", done, len(blocks))
-    return OptimumSample(P, bias)
+    return OptimumSample(P, bias, heard)
 
 
 class _ContactWork(NamedTuple):
@@ -132,20 +138,21 @@ class _ContactWork(NamedTuple):
     system: System
     size: int
 
-    def follow(self, block: RunBlock) -> tuple[int, int, np.ndarray, np.ndarray | None]:
-        """Row and first run of a block, covariances (runs, steps, agents, d, d) and biases (…, d, 1)."""
+    def follow(self, block: RunBlock) -> tuple[int, int, np.ndarray, np.ndarray | None, np.ndarray]:
+        """Row and first run of a block, covariances (runs, steps, agents, d, d), biases (…, d, 1), numbers heard."""
         runs, system = block.size, self.system
         P = np.empty((runs, system.steps, system.agents, system.dimension, system.dimension))
         bias = None if system.error is None else np.empty((*P.shape[:-1], 1))
+        heard = np.empty(P.shape[:3], np.uint16)
         drawn = self.outcomes.of(block)
         for first in range(0, runs, self.size):
             part = slice(first, min(first + self.size, runs))
             steps = (of_runs(now, part, system.agents) for now in drawn)
-            for k, (now, left) in enumerate(_followed(self.riccati, steps, part.stop - first, system.agents)):
-                P[part, k] = now
+            for k, (now, left, number) in enumerate(_followed(self.riccati, steps, part.stop - first, system.agents)):
+                P[part, k], heard[part, k] = now, number
                 if bias is not None:
                     bias[part, k] = left
-        return block.row, block.first, P, bias
+        return block.row, block.first, P, bias, heard
 
 
 def _all_followed(work: _ContactWork, blocks: Sequence[RunBlock], workers: int) -> Iterator[Any]:
@@ -202,8 +209,8 @@ class _ContactOutcomes:
 
 def _followed(
     riccati: _Riccati, steps: Iterator[StepOutcomes], runs: int, agents: int
-) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
-    """Covariance (runs, agents, d, d) and bias (runs, agents, d, 1) after every step.
+) -> Iterator[tuple[np.ndarray, np.ndarray | None, np.ndarray]]:
+    """Covariance (runs, agents, d, d), bias (runs, agents, d, 1) and number heard (runs, agents) after every step.
 
     The sets of the steps from `low` on, the first whose data not everybody holds, are rows of words
     (runs·agents, steps, words); what they were before an exchange is kept as long as messages are under way.
@@ -228,7 +235,7 @@ def _followed(
                 _joined(sets, low, before[k - delay], schedule[k - delay][delay])
         grown = _in_any_word(sets[:, :-1] != held[:, :-1])
         first = np.where(grown.any(axis=1), grown.argmax(axis=1) if grown.shape[1] else 0, k - low)
-        yield riccati.after(filters, sets, low, first, (runs, agents))
+        yield *riccati.after(filters, sets, low, first, (runs, agents)), _members(sets[:, -1]).reshape(runs, agents)
         while sets.shape[1] and (sets[:, 0].reshape(runs, agents, -1) == most[low][:, None]).all():
             sets, low = sets[:, 1:], low + 1
         _forget(before, schedule, k)

@@ -33,7 +33,7 @@ _LAST = np.iinfo(np.int64).max
 _RANDOM = np.random.default_rng(7).integers(1 << 64, size=(2, 4, 64), dtype=np.uint64) | np.uint64(1)
 
 
-class Agent(NamedTuple):
+class HeldEstimate(NamedTuple):
     """An agent before an exchange: value of its local estimate and the pedigree it rests on, as a mask of nodes."""
 
     value: int
@@ -51,7 +51,7 @@ class GraphState(NamedTuple):
     """
 
     nodes: tuple[tuple[int, int], ...]
-    agents: tuple[Agent, ...]
+    agents: tuple[HeldEstimate, ...]
     late: tuple[tuple[int, int, int], ...] = ()
 
 
@@ -319,7 +319,7 @@ def _states(rows: Sequence[np.ndarray]) -> list[GraphState]:
     numbers = (rows[0] >= 0).sum(axis=1).tolist()
     nodes, below, agents, known = (part.tolist() for part in rows)
     return [
-        GraphState(tuple(zip(v[:m], b[:m], strict=True)), tuple(map(Agent, a, k)))
+        GraphState(tuple(zip(v[:m], b[:m], strict=True)), tuple(map(HeldEstimate, a, k)))
         for m, v, b, a, k in zip(numbers, nodes, below, agents, known, strict=True)
     ]
 

@@ -37,7 +37,7 @@ from stochfuse.explore import answers, saved, state
 from stochfuse.explore.answers import Curve, Line, PageAnswer, QuestionWorker
 from stochfuse.explore.charts import DARK, LIGHT, Chart, NetworkChart, key_of
 from stochfuse.explore.network import Picture
-from stochfuse.explore.saved import Shown, axes_of, lines_of
+from stochfuse.explore.saved import PageContents, axes_of, lines_of
 from stochfuse.explore.state import OpenedScenario, PageInput, field_of
 from stochfuse.scenario.registry import ESTIMATORS, LFG, SIMPLIFIED
 from stochfuse.scenario.scenario import preset_names
@@ -599,10 +599,10 @@ class Page:
         elif kind == "CSV":
             self._save("page.csv", saved.records(curves))
         else:
-            shown = Shown(curves, self._picture, self._loads, self._least_told)
+            shown = PageContents(curves, self._picture, self._loads, self._least_told)
             threading.Thread(target=self._draw, args=(kind, asked, shown), daemon=True).start()
 
-    def _draw(self, kind: str, asked: PageInput, shown: Shown) -> None:
+    def _draw(self, kind: str, asked: PageInput, shown: PageContents) -> None:
         try:
             text = saved.page_of(asked, shown) if kind == "Report" else saved.figure_of(asked, shown.curves)
         except StochfuseError as error:

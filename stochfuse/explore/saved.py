@@ -27,7 +27,7 @@ DASH = {"claimed": "dashed", "actual": "solid", "consistency": "solid", "bias": 
 KINDS = {"link": "link probability µ of all links", "own": "µ of all links, if alike", "power": "radio power [dBm]"}
 
 
-class Shown(NamedTuple):
+class PageContents(NamedTuple):
     """What the page shows; what is not there yet is None.
 
     Parameters
@@ -105,7 +105,7 @@ def records(curves: Sequence[Curve]) -> str:
     return to_csv(headings, [[row.get(key, "") for key in headings] for row in rows])
 
 
-def _tables(asked: PageInput, shown: Shown) -> list[Table]:
+def _tables(asked: PageInput, shown: PageContents) -> list[Table]:
     """The present numbers, the curves', what links are worth, and the messages."""
     views = {c.name: c.views for c in shown.curves}
     found = [numbers(asked, shown.curves)]
@@ -135,7 +135,7 @@ def _worth(picture: Picture) -> list[tuple[str, ...]]:
     ]
 
 
-def page_of(asked: PageInput, shown: Shown) -> str:
+def page_of(asked: PageInput, shown: PageContents) -> str:
     """Return a page to be sent, of all that is shown."""
     lines = asked.commands([c.name for c in shown.curves if c.sampled])
     if any(FILE in line for line in lines):

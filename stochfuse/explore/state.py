@@ -1,7 +1,7 @@
 """What is asked of the page: a scenario, what is changed in it, and what is to be shown.
 
-An `Asked` is immutable, and from it comes everything else: the scenario, and the same question as commands, as Python
-and as a file.  What is opened in the page is content alone: a name in it never becomes a path (`opened`).
+A `PageInput` is immutable, and from it comes everything else: the scenario, and the same question as commands, as
+Python and as a file.  What is opened in the page is content alone: a name in it never becomes a path (`opened`).
 """
 
 from __future__ import annotations

@@ -154,6 +154,11 @@ class Moments(NamedTuple):
         return cls(P, actual, bias, actual + bias @ np.swapaxes(bias, -1, -2))
 
     @classmethod
+    def of_optimum(cls, P: Any, bias: Any) -> Moments:
+        """Return the moments of what achieves what it claims; without a known error nothing is known of a bias."""
+        return cls(P, P, None, P) if bias is None else cls.of(P, P, bias)
+
+    @classmethod
     def of_footprint(cls, P: Any, x: Any) -> Moments:
         """Return the moments from noise footprints x, (..., d, columns), whose last column is the bias."""
         noises, bias = x[..., :-1], x[..., -1:]

@@ -8,6 +8,10 @@ like agents,
     E[Y] ≈ 1/R Σ_r Y_r − β_(r) w (X_r − E[X])            w = 1        where E[X] is exact
                                                          w = 1 − R/N  where it is the mean of the N − R further runs
 
+Of the optimum itself, sampled, X is a filter of the numbers heard (`stochfuse.engines.heard`), of known expectation for
+any network.  At step 1 the two are one.  Where nearly all that varies is taken away, what is left comes of outcomes so
+rare that a sample may not have met one: at later steps so much is added to the error, `UNMET`.
+
 The coefficient β_(r) = cov(Y, X)/var(X) is that of all blocks of runs but the one that r is in (splitting: Nelson 1990,
 Operations Research 38, 974; Avramidis and Wilson 1993, Operations Research Letters 14, 187).  So it is independent of
 what it corrects: the mean is unbiased at any R, and the terms of the sum, each a prediction error outside the runs that
@@ -23,9 +27,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, lru_cache, partial
 from math import ceil, sqrt
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,24 +42,28 @@ from stochfuse.engines.contact_chain import (
     expected_optimum,
     number_of_paths,
 )
-from stochfuse.engines.contact_sample import sample_optimum
+from stochfuse.engines.contact_sample import OptimumSample, sample_optimum
 from stochfuse.engines.enclosure import enclosed_optimum
+from stochfuse.engines.heard import Heard
 from stochfuse.engines.monte_carlo import size_of_block
+from stochfuse.engines.precision import suspects
 from stochfuse.errors import UsageError
 from stochfuse.kalman.metrics import Moments
 from stochfuse.prediction.method import Settings
 from stochfuse.scenario import capabilities
 from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.registry import CHAIN, NO_CONTROL, OPTIMAL, STAND_ALONE, SUMS
-from stochfuse.scenario.system import System
+from stochfuse.scenario.system import Noises, System
 
-KIND = "exact optimum"
+KIND, HEARD = "exact optimum", "numbers heard"
 WORTH = 1.2
 """Reduction of the variance below which a sample is left as it is."""
 BLOCKS = 25
 """Blocks of runs; β of one is from all the others."""
 UNLIKELY = 5.0
 """Standard errors of the optimum's mean from its expectation that tell of outcomes that were not met."""
+UNMET = 0.004
+"""What the numbers heard leave of an outcome too rare to be met, about, relative to the value; so rare: 1/runs."""
 FLAT = 1e-12
 """Least eigenvalue of a covariance, scaled to unit variances, that is rounding."""
 MOST_NUMBERS, MOST_STATES, MOST_SETS = 20_000_000, 600, 8
@@ -66,6 +74,8 @@ COSTS = (30.0, 8.0)
 """What a run of an estimator that removes what is common, or of another one, costs in runs of the optimum, about."""
 FURTHER = (4.0, 40.0)
 """Least and most further runs of the optimum for every run."""
+FEW = 12
+"""Agents of the optimum up to which equal histories, gathered, pay, and its expectation is known anyway."""
 MOST_HELD = 100_000_000
 """Entries of the optimum's covariances that are held."""
 SEPARATE = 1 << 20
@@ -159,9 +169,8 @@ def coefficients(y: np.ndarray, x: np.ndarray, usual: float = 1.0) -> np.ndarray
     unless x̄ lies beyond five of its standard errors from 0: where outcomes that matter are too rare to have been met,
     β tends to what is usual.
     """
-    runs = len(x)
-    starts = np.arange(min(BLOCKS, runs)) * runs // min(BLOCKS, runs)
-    left = (runs - np.diff(starts, append=runs)).reshape(-1, *(1,) * (x.ndim - 1))
+    starts, left, block_of = _blocks(len(x))
+    left = left.reshape(-1, *(1,) * (x.ndim - 1))
 
     def sums(m: np.ndarray) -> np.ndarray:
         """Σ of all blocks but each."""
@@ -174,7 +183,14 @@ def coefficients(y: np.ndarray, x: np.ndarray, usual: float = 1.0) -> np.ndarray
     far = np.maximum(sums(x) ** 2 / left - (UNLIKELY**2 / left) * variance, 0.0)
     total = variance + far
     β = np.divide(common + usual * far, total, out=np.full_like(total, usual), where=total > 0)
-    return β[np.searchsorted(starts, np.arange(runs), side="right") - 1]
+    return β[block_of]
+
+
+@lru_cache(maxsize=8)
+def _blocks(runs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """First run of every block, how many runs are left without it, and the block of every run."""
+    starts = np.arange(min(BLOCKS, runs)) * runs // min(BLOCKS, runs)
+    return starts, runs - np.diff(starts, append=runs), np.searchsorted(starts, np.arange(runs), side="right") - 1
 
 
 def _indefinite(m: np.ndarray) -> bool:
@@ -188,7 +204,7 @@ def _indefinite(m: np.ndarray) -> bool:
 
 def no_control(system: System, links: LinkRows, how: Settings) -> str | None:
     """Why there is no control for a sample, in words, empty where nothing needs to be said; None if there is one."""
-    if how.control == NO_CONTROL or how.estimator in (OPTIMAL, STAND_ALONE):
+    if how.control == NO_CONTROL or how.estimator == STAND_ALONE or (how.estimator == OPTIMAL and system.agents <= FEW):
         return ""
     try:
         capabilities.require(system, links, OPTIMAL, CHAIN)
@@ -200,21 +216,67 @@ def no_control(system: System, links: LinkRows, how: Settings) -> str | None:
     return None
 
 
-def optimum_of(system: System, links: LinkRows, how: Settings, blocks: list[tuple[int, int]]) -> Moments:
-    """Return the optimum's moments in the runs of a sample, (rows, runs, steps, agents, …).
+class FollowedOptimum:
+    """What goes with the runs of a sample that may grow: the optimum, or of that itself what stands in for it.
 
     Parameters
     ----------
-    blocks : number of runs, and first block of random numbers, of every part of the sample.
+    how : seed, workers and estimator.
     """
-    parts = [sample_optimum(system, links, runs, how.seed, workers=how.workers, first=first) for runs, first in blocks]
-    P = np.concatenate([part.P for part in parts], axis=1)
-    return _moments(P, np.concatenate([b for part in parts if (b := part.bias) is not None] or [P[:0]], axis=1))
 
+    def __init__(self, system: System, links: LinkRows, how: Settings) -> None:
+        self._asked, self._waiting = (system, links, how), []
+        self._found: list[np.ndarray | None] = []
+        self._parts = 0
+        self.kind = HEARD if how.estimator == OPTIMAL else KIND
 
-def _moments(P: np.ndarray, bias: np.ndarray) -> Moments:
-    """The optimum achieves what it claims; without a known error nothing is known of a bias."""
-    return Moments(P, P, bias, P + bias @ np.swapaxes(bias, -1, -2)) if len(bias) else Moments(P, P, None, P)
+    @cached_property
+    def expected(self) -> ControlExpectation | None:
+        """What is expected of it; None where that is not cheap."""
+        system, links, _ = self._asked
+        if self.kind == KIND:
+            return expectation(system, links)
+        if self.heard is None:
+            return None
+        return ControlExpectation(self.heard.expected(), np.zeros((len(links.link), system.steps)))
+
+    def expected_beside(self, runs: int) -> ControlExpectation | None:
+        """What is expected of it, and how far a mean of so many runs may be off by what they did not meet."""
+        found = self.expected
+        if found is None or self.kind == KIND:
+            return found
+        first = np.arange(found.bound.shape[1]) == 0  # where it is the optimum
+        return found._replace(bound=found.bound + np.where(first, 0.0, UNMET / runs))
+
+    @cached_property
+    def heard(self) -> Heard | None:
+        """What stands in for the optimum; None where rounding may matter."""
+        system, links, _ = self._asked
+        return None if suspects(system, Noises(P0=system.P0[None])).any() else Heard(system, links)
+
+    def drawn(self, runs: int, first: int) -> OptimumSample:
+        """Draw the optimum of a further part of the sample: number of runs, and first block of random numbers."""
+        system, links, how = self._asked
+        found = sample_optimum(system, links, runs, how.seed, workers=how.workers, first=first)
+        if self.kind == HEARD:
+            self._waiting.append(found.heard)
+        return found
+
+    def in_runs(self, parts: Sequence[tuple[int, int]]) -> Moments:
+        """Moments in the runs of a sample of such parts, (rows, runs, steps, agents, …), each followed once."""
+        for runs, first in parts[self._parts :]:
+            if self.kind == KIND:
+                found = self.drawn(runs, first)
+                more = found.P, found.bias
+            else:
+                if self.heard is None:
+                    raise ValueError("nothing stands in for the optimum")
+                more = self.heard.of(self._waiting.pop(0))
+            before = self._found or [None if m is None else m[:, :0] for m in more]
+            pairs = zip(before, more, strict=True)
+            self._found = [None if m is None or n is None else np.concatenate([m, n], axis=1) for m, n in pairs]
+            self._parts += 1
+        return Moments.of_optimum(*self._found)
 
 
 def expectation(system: System, links: LinkRows) -> ControlExpectation | None:
@@ -267,7 +329,6 @@ def estimated(system: System, links: LinkRows, how: Settings, correlation: float
     return ControlExpectation(means.map(lambda m: m.mean(axis=1)), bound, means, blocks * size / how.runs)
 
 
-def _mean(drawn: Any) -> Moments:
+def _mean(drawn: OptimumSample) -> Moments:
     """Mean moments of the optimum in some runs, (rows, steps, agents, …)."""
-    moments = _moments(drawn.P, drawn.P[:0] if drawn.bias is None else drawn.bias)
-    return moments.map(lambda m: m.mean(axis=1))
+    return Moments.of_optimum(drawn.P, drawn.bias).map(lambda m: m.mean(axis=1))

@@ -189,9 +189,9 @@ def _exactly(scenario: Scenario, link: Any, how: Settings, quantity: str) -> Pre
     more = 1.0 if how.at_most is None else max(1.0, seconds(how.at_most) / PATIENT)
     try:
         if how.estimator == OPTIMAL:
-            found = predict(scenario, link, OPTIMAL, quantity)
+            found = predict(scenario, link, OPTIMAL, quantity, runs=2, workers=1)  # two tell that it would be a sample
         else:
-            graphs = int(more * min(EASY, EASILY / 2.0 ** exchange_of(scenario, link)))
+            graphs = int(more * min(EASY, EASILY * 2.0 ** -exchange_of(scenario, link)))
             if not graphs:
                 return None
             kept = {"estimator": how.estimator, "criterion": how.criterion, "max_graphs": graphs}

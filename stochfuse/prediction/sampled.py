@@ -4,7 +4,8 @@ Standard errors are those of the mean over independent runs.  Agents that are al
 their errors are dependent, the runs are not.  For a metric that is not linear in the covariance the error is carried
 through by the metric's derivative at the mean (delta method), taken by central differences.
 
-Wherever it helps, the exact optimum is the sample's control variate (`stochfuse.prediction.control`).  How many runs a
+Wherever it helps, the exact optimum is the sample's control variate (`stochfuse.prediction.control`), and of the
+optimum of many agents itself a filter of the numbers heard.  How many runs a
 precision takes is found in `stochfuse.prediction.stopping`.
 
 Runs that all met one value say nothing of what they did not meet.  Where they are too few to have met more than the
@@ -17,14 +18,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cache, partial
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.engines.contact_sample import sample_optimum
-from stochfuse.engines.events import concerning, events, relabellings
+from stochfuse.engines.events import events, relabellings
 from stochfuse.engines.monte_carlo import Experiment, Sample, sample, size_of_block
 from stochfuse.errors import UsageError
 from stochfuse.estimators.making import kinds_of, make, make_together
@@ -33,29 +33,31 @@ from stochfuse.estimators.world import claimed_only, moments
 from stochfuse.kalman.metrics import Metric, Moments
 from stochfuse.kalman.metrics import metric as metric_of
 from stochfuse.prediction.control import (
+    FEW,
     KIND,
     MOST_HELD,
     WORTH,
     Control,
     ControlExpectation,
+    FollowedOptimum,
     coefficients,
     estimated,
-    expectation,
     no_control,
-    optimum_of,
 )
 from stochfuse.prediction.general import groups_alike, spread
 from stochfuse.prediction.method import Averaged, Settings, ShownPart, group_of, joined, seconds, share
 from stochfuse.prediction.quantities import needed, value
-from stochfuse.prediction.stopping import Parts, sampled_to
+from stochfuse.prediction.stopping import FEWEST, FIRST, Parts, sampled_to
 from stochfuse.scenario.network import LinkRows
-from stochfuse.scenario.registry import NO_CONTROL, OPTIMAL, STAND_ALONE
+from stochfuse.scenario.registry import LFG, NO_CONTROL, OPTIMAL, STAND_ALONE
 from stochfuse.scenario.system import Items, Noises, System
 
 MOST_NUMBERS = 500_000_000
 """Claimed values that a sample may hold."""
-FEW, MOST_ENTRIES = 12, 200_000_000
-"""Agents of the optimum up to which equal histories, gathered, pay; entries of its covariances in a sample."""
+MOST_ENTRIES = 200_000_000
+"""Entries of the optimum's covariances in a sample."""
+DEAR = 40_000
+"""Runs times links of a first stage where runs are dear: of the Local Fusion Graph."""
 FEW_TOGETHER = 6
 """Agents up to which equal histories, gathered, pay more than following many runs at a time."""
 MANY = 10_000
@@ -84,6 +86,7 @@ class MomentSample:
     groups: tuple[tuple[int, ...], ...]
     odds: np.ndarray
     control: Control | None = None
+    _judged: dict[Any, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def runs(self) -> int:
@@ -119,6 +122,12 @@ class MomentSample:
 
     def judged(self, metric: Metric, groups: Sequence[int], quantity: str) -> tuple[np.ndarray, np.ndarray]:
         """A quantity of the mean over the agents of some groups, and its standard error, each (rows, steps)."""
+        asked = metric.name, tuple(groups), quantity
+        if asked not in self._judged:
+            self._judged[asked] = self._judge(metric, groups, quantity)
+        return self._judged[asked]
+
+    def _judge(self, metric: Metric, groups: Sequence[int], quantity: str) -> tuple[np.ndarray, np.ndarray]:
         values, index = needed(quantity, self.sample.values), self.sample.which
         of = partial(value, quantity, metric)
         shown, out = np.empty((2, index.shape[0], index.shape[2]))
@@ -255,16 +264,16 @@ def sampled(
     permutations = relabellings(network, links, kinds)
     groups = groups_alike(network, links, kinds, permutations)
     odds = _odds(system, links, groups, how.estimator)
-    known = cache(lambda: expectation(system, links))  # the same at every stage of a sample that grows
+    optimum = FollowedOptimum(system, links, how)
 
     def draw(before: Sample | None, runs: int, first: int) -> Sample:
         now = replace(how, runs=runs)
         if how.estimator == OPTIMAL and network.agents > FEW:
-            return _extended(before, _optimum(system, links, now, first, errors))
+            return _extended(before, _optimum(optimum, system, len(links.link), now, first, errors))
         return _extended(before, _drawn(system, links, now, permutations, first=first, errors=errors))
 
     def judge(drawn: Sample, parts: Parts) -> tuple[tuple[MomentSample, str, Reduced], float]:
-        found = helped(system, links, how, MomentSample(drawn, groups, odds), parts, shown, known)
+        found = helped(system, links, how, MomentSample(drawn, groups, odds), parts, shown, optimum)
         values, error = found[0].shown(system, shown)
         there = error > 0
         with np.errstate(divide="ignore"):  # no error but 0 is a share of 0
@@ -275,9 +284,11 @@ def sampled(
         return found, tuple(filter(None, (said, *rare(system, links, found)))), {"control": control._asdict()}
     numbers = len(links.link) * system.steps * system.agents
     most = min(MOST_NUMBERS // numbers, MOST_HELD // numbers // system.dimension**2)
+    dear = system.agents > FEW_TOGETHER and how.estimator == LFG
+    first = max(FEWEST, min(FIRST, DEAR // system.agents**2)) if dear else FIRST
     limit = None if how.at_most is None else seconds(how.at_most)
     block = size_of_block(system.agents)
-    (found, said, control), reached = sampled_to(share(how.precision), limit, most, block, draw, judge)
+    (found, said, control), reached = sampled_to(share(how.precision), limit, (first, most), block, draw, judge)
     meta = {"control": control._asdict(), "precision": reached.for_programs}
     told = f"precision {100 * reached.reached:.2g} % of each value after {found.runs:,} runs"
     told += f", {100 * reached.asked:.3g} % asked for: {reached.stopped}" if reached.stopped else ""
@@ -306,14 +317,17 @@ def helped(
     plain: MomentSample,
     parts: Parts,
     shown: ShownPart,
-    known: Callable[[], ControlExpectation | None],
+    optimum: FollowedOptimum,
 ) -> tuple[MomentSample, str, Reduced]:
-    """Correct a sample by the optimum, of `known` expectation, where that helps; also what to say of it."""
+    """Correct a sample by the optimum, or what stands in for it, where that helps; also what to say of it."""
     how = replace(how, runs=plain.runs)
     why = no_control(system, links, how)
     if why is not None or not plain.odds.any():
         return plain, f"control: none; {why}" if why else "", Reduced()
-    runs, expected = optimum_of(system, links, how, parts), known()
+    expected = optimum.expected_beside(plain.runs)
+    if expected is None and how.estimator == OPTIMAL:
+        return plain, "", Reduced()
+    runs = optimum.in_runs(parts)
     # of an unknown expectation as if it were the sample's mean, to see whether further runs are worth their time
     own = ControlExpectation(runs.map(lambda m: m.mean(axis=1)), np.zeros(plain.odds.shape[:2]))
     found = replace(plain, control=Control(runs, expected or own))
@@ -325,12 +339,17 @@ def helped(
     if reduction == 0.0:  # nothing is uncertain
         return plain, "", Reduced()
     if reduction < WORTH or expected is None:
-        why = f"the exact optimum takes away too little of the variance (1/{reduction:.2f})"
+        takes = "takes" if optimum.kind == KIND else "take"
+        why = f"the {optimum.kind} {takes} away too little of the variance (1/{reduction:.2f})"
         return plain, f"control: none; {why}", Reduced()
     mean = "exact" if expected.further is None else "estimated"
     by = "" if mean == "exact" else f"; its mean from {expected.runs:.3g} times as many runs of its own"
     told = f"1/{float(f'{reduction:.3g}'):,g}" if reduction < 1e6 else "less than a millionth"
-    return found, f"control: {KIND}; variance {told}{by}", Reduced(KIND, min(reduction, MOST_REDUCED), mean)
+    return (
+        found,
+        f"control: {optimum.kind}; variance {told}{by}",
+        Reduced(optimum.kind, min(reduction, MOST_REDUCED), mean),
+    )
 
 
 def _reduction(plain: MomentSample, found: MomentSample, system: System, shown: ShownPart) -> float:
@@ -341,16 +360,20 @@ def _reduction(plain: MomentSample, found: MomentSample, system: System, shown: 
     return 0.0 if before == 0 else float(before / max(after, before / MOST_REDUCED))
 
 
-def _odds(system: System, links: LinkRows, groups: Sequence[Sequence[int]], estimator: str) -> np.ndarray:
+def _odds(system: System, links: LinkRows, groups: Sequence[tuple[int, ...]], estimator: str) -> np.ndarray:
     """Probability that not just the likeliest becomes of what may reach groups at a step, (rows, steps, groups)."""
     likeliest = np.ones((len(links.link), system.steps, len(groups)))
+    group, of_links = group_of(groups), np.ones((len(links.link), len(groups)))
     for step in range(1, system.steps + 1):
-        drawn = [] if estimator == STAND_ALONE else events(system.network, links, step)
-        for g, group in enumerate(groups):
-            for event in concerning(drawn, group):
-                likeliest[:, step - 1, g] *= np.maximum(1.0 - event.probability, event.probability * max(event.delay))
-            for agent, p in system.detections(step):
-                likeliest[:, step - 1, g] *= max(p, 1.0 - p) if agent in group else 1.0
+        if step == 1 or links.varies:
+            of_links = np.ones((len(links.link), len(groups)))
+            for event in [] if estimator == STAND_ALONE else events(system.network, links, step):
+                likely = np.maximum(1.0 - event.probability, event.probability * max(event.delay))
+                for g in {int(group[i]) for i in event.receivers}:
+                    of_links[:, g] *= likely
+        likeliest[:, step - 1] = of_links
+        for agent, p in system.detections(step):
+            likeliest[:, step - 1, group[agent]] *= max(p, 1.0 - p)
     return np.where(likeliest < 1.0, 1.0 - likeliest, 0.0)
 
 
@@ -400,13 +423,12 @@ def states(system: System, links: LinkRows, how: Settings, records: np.ndarray) 
     permutations = relabellings(system.network, links, range(system.agents))
     drawn = _drawn(system, links, how, permutations, records=records)
     x = drawn.values.x[..., 0][drawn.which]
-    expected = None if no_control(system, links, how) is not None else expectation(system, links)
+    optimum = FollowedOptimum(system, links, how)
+    expected = None if no_control(system, links, how) is not None else optimum.expected
     if expected is None:
         return x, x
     # variances say of an estimate only how it hangs together with them: there is no usual coefficient
-    of, mean = (
-        np.diagonal(P, axis1=-2, axis2=-1) for P in (optimum_of(system, links, how, [(how.runs, 0)]).P, expected.mean.P)
-    )
+    of, mean = (np.diagonal(P, axis1=-2, axis2=-1) for P in (optimum.in_runs([(how.runs, 0)]).P, expected.mean.P))
     off = of - mean[:, None]
     return x, np.stack([x[r] - coefficients(x[r], off[r], 0.0) * off[r] for r in range(len(x))])
 
@@ -455,22 +477,23 @@ def _drawn(
     )
     workers = how.workers
     if workers is None:
-        outcomes = how.runs * rows * (1 if experiment.together is None else network.agents)
+        links_of_a_run = network.agents ** (2 if how.estimator == LFG else 1)
+        outcomes = how.runs * rows * (1 if experiment.together is None else links_of_a_run)
         many = outcomes >= MANY and getattr(how.estimator, "travels", True)
         workers = len(os.sched_getaffinity(0)) if many else 1
     return sample(experiment, rows, workers=workers)
 
 
-def _optimum(system: System, links: LinkRows, how: Settings, first: int, errors: bool) -> Sample:
+def _optimum(optimum: FollowedOptimum, system: System, rows: int, how: Settings, first: int, errors: bool) -> Sample:
     """Sample the optimum by Boolean products: nearly every history of many agents has a value of its own."""
-    n, d, steps, rows = system.agents, system.dimension, system.steps, len(links.link)
+    n, d, steps = system.agents, system.dimension, system.steps
     entries = how.runs * rows * steps * n * d**2
     if entries > MOST_ENTRIES:
         raise UsageError(
             f"runs: {how.runs} runs for {rows} link probabilities, {steps} steps and {n} agents of {d} states are "
             f"{entries:.3g} entries of covariances; expected at most {MOST_ENTRIES:.3g}"
         )
-    found = sample_optimum(system, links, how.runs, how.seed, workers=how.workers, first=first)
+    found = optimum.drawn(how.runs, first)
     P = found.P.reshape(-1, d, d)
     values = Moments(P)
     if errors:

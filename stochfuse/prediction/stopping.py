@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 from stochfuse.engines.monte_carlo import BLOCK
 from stochfuse.engines.progress import within
 
-FIRST = 400
-"""Runs of the first stage."""
+FIRST, FEWEST = 400, 24
+"""Most and fewest runs of the first stage."""
 GROWTH = 40
 """How many times as many runs a stage makes of those before."""
 PARTS = 8
@@ -99,7 +99,7 @@ class _Drawing:
 def sampled_to(
     asked: float,
     at_most: float | None,
-    most: int,
+    sizes: tuple[int, int],
     block: int,
     draw: Callable[[Any, int, int], Any],
     judge: Callable[[Any, Parts], tuple[Any, float]],
@@ -109,12 +109,13 @@ def sampled_to(
     Parameters
     ----------
     asked, at_most : precision, and seconds or None.
-    most : runs that can be held.
+    sizes : runs of the first stage, and runs that can be held.
     block : runs that are drawn from one seed.
     draw : goes on with a sample (None at first), by so many runs, from a block of random numbers on.
     judge : what a sample, of some parts, comes to, and its largest share of a standard error in its value.
     """
-    drawing, target = _Drawing(draw, at_most, block, f"to {100 * asked:.3g} % of every value"), min(FIRST, most)
+    drawing, most = _Drawing(draw, at_most, block, f"to {100 * asked:.3g} % of every value"), sizes[1]
+    target = min(sizes)
     while True:
         in_time = drawing.to(target)
         found, reached = judge(drawing.sample, drawing.parts)

@@ -45,7 +45,8 @@ TERMS = {
     ),
     "control variate": (
         "What is drawn along with a sampled value and has a known mean: by what its own sample is off, the value is "
-        "corrected. Here the exact optimum of every outcome; see --control and --precision."
+        "corrected. Here the exact optimum of every outcome, and of that itself a filter of the numbers heard; see "
+        "--control and --precision."
     ),
     "pedigree": (
         "Of an estimate: the set of measurements and first estimates that went into it. What two "

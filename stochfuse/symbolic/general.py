@@ -71,6 +71,36 @@ class GeneralForm:
     quantity: str = CLAIMED
     error: Any = sympy.S.Zero
 
+    def showing(self, quantity: str, initial_error: Any = None) -> GeneralForm:
+        """Return the same of another quantity.
+
+        Parameters
+        ----------
+        quantity : "claimed"; "actual", the covariance of the error; or "rms", of which the form is the mean squared
+            error: actual, and the square of the bias from the initial error.
+        initial_error : known error b of all initial estimates, for "rms": a number or its text, or None for a symbol.
+
+        Raises
+        ------
+        UsageError
+            If there is no such quantity, a number is none, or the form is that of the optimum, which claims what is
+            true.
+
+        Examples
+        --------
+        >>> import stochfuse as sf
+        >>> sf.derive_general(2, 1, 25, 100, 100).showing("rms", -1000).closed()
+        1000100 - 50*mu
+        """
+        if quantity not in QUANTITIES:
+            raise UsageError(f"quantity: expected one of {', '.join(QUANTITIES)}, got '{quantity}'")
+        if quantity != CLAIMED and self.estimator == OPTIMAL:
+            raise UsageError(f"quantity {quantity}: expected formulation general or naive, got optimal")
+        if quantity != RMS and initial_error is not None:
+            raise UsageError(f"initial_error: expected quantity rms, got {quantity}")
+        error = exact_number("initial_error", initial_error, B, signed=True) if quantity == RMS else sympy.S.Zero
+        return replace(self, quantity=quantity, error=error)
+
     @property
     def symbols(self) -> tuple[sympy.Symbol, ...]:
         """The symbols among q, r, p0 and b."""
@@ -245,8 +275,6 @@ def derive_general(
     architecture: str = "ad-hoc",
     correlation: str = "independent",
     estimator: str = LFG,
-    quantity: str = CLAIMED,
-    initial_error: Any = None,
 ) -> GeneralForm:
     """Return (49) as formulas, for like agents with a scalar state.
 
@@ -257,9 +285,6 @@ def derive_general(
     architecture : "ad-hoc", "broadcast" or "cyclic".
     correlation : "independent" or "shared" initial estimates.
     estimator : "local-fusion-graph", "naive" or "optimal".
-    quantity : "claimed"; "actual", the covariance of the error; or "rms", of which the form is the mean squared error:
-        actual and the square of the bias from the initial error.  The optimum's actual is what it claims.
-    initial_error : known error b of all initial estimates, for "rms": a number or its text, or None for a symbol.
 
     Returns
     -------
@@ -279,26 +304,11 @@ def derive_general(
     for name, value in (("agents", agents), ("step", step)):
         if value < 1:
             raise UsageError(f"{name}: expected at least 1, got {value}")
-    if quantity not in QUANTITIES:
-        raise UsageError(f"quantity: expected one of {', '.join(QUANTITIES)}, got '{quantity}'")
-    if quantity != CLAIMED and estimator == OPTIMAL:
-        raise UsageError(f"quantity {quantity}: expected formulation general or naive, got optimal")
-    if quantity != RMS and initial_error is not None:
-        raise UsageError(f"initial_error: expected quantity rms, got {quantity}")
     numbers = [exact_number(n, v, s) for n, v, s in (("q", q, Q), ("r", r, R), ("p0", p0, P0))]
     for name, number in (("r", numbers[1]), ("p0", numbers[2])):
         if number == 0:
             raise UsageError(f"{name}: expected a positive number, got 0")
-    return GeneralForm(
-        agents,
-        step,
-        architecture,
-        *numbers,
-        shared=correlation == "shared",
-        estimator=estimator,
-        quantity=quantity,
-        error=exact_number("initial_error", initial_error, B, signed=True) if quantity == RMS else sympy.S.Zero,
-    )
+    return GeneralForm(agents, step, architecture, *numbers, shared=correlation == "shared", estimator=estimator)
 
 
 def _exact(coefficients: np.ndarray) -> list[sympy.Integer]:

@@ -15,7 +15,7 @@ from stochfuse.errors import ScenarioError, StochfuseError, UsageError
 from stochfuse.explore import answers, saved
 from stochfuse.explore.answers import QuestionWorker
 from stochfuse.explore.network import picture
-from stochfuse.explore.saved import Shown
+from stochfuse.explore.saved import PageContents
 from stochfuse.explore.state import OpenedScenario, PageInput, begun, field_of, opened, preset, with_log
 from stochfuse.scenario.as_toml import to_toml
 from tests.cli.command import run, strict_json
@@ -148,7 +148,7 @@ def test_a_page_to_be_sent_has_all_that_is_shown():
     question = asked(steps=2, link=0.4, target=50.0, sensors=((0, 4.0),), estimators=("local-fusion-graph", "naive"))
     found = [answer(question, name) for name in ("simplified", "estimator local-fusion-graph", "estimator naive")]
     found[2][0] = found[2][0]._replace(sampled=True)  # of other links than those that are exact
-    shown = Shown(
+    shown = PageContents(
         [c for some in found for c in some], *(answer(question, n) for n in ("sensitivity", "messages", "least"))
     )
     page = saved.page_of(question, shown)

@@ -142,6 +142,24 @@ def test_two_levels(monkeypatch):
     np.testing.assert_allclose(again.values(), found.values(), rtol=1e-12)
 
 
+@pytest.mark.parametrize(("network", "link"), [({}, 0.2), ({"architecture": "cyclic"}, 0.9)])
+def test_the_optimum_of_many_agents_is_corrected_by_the_numbers_heard(network, link):
+    """z-scores of 60 samples against the chain, which takes like agents; what is left of the variance."""
+    scenario = small({"agents": 13, "steps": 4, **network})
+    exact = sf.predict(scenario, [link], "optimal").values()
+    found = drawn(scenario, [link], estimator="optimal", runs=60 * 150)
+    assert found.meta["control"]["kind"] == "numbers heard"
+    assert found.meta["control"]["expected"] == "exact"
+    assert found.meta["control"]["variance_reduction"] > 50
+    trace, everyone = metric("trace", scenario.model), range(len(found.sampled.groups))
+    each = [part.judged(trace, everyone, "claimed") for part in parts(found.sampled, 150)]
+    values, errors = (np.array(some)[:, 0] for some in zip(*each, strict=True))
+    np.testing.assert_allclose(values[:, 0], exact[0, 0], rtol=1e-12)  # step 1 is known
+    z = (values - exact[0])[:, 1:] / errors[:, 1:]
+    assert np.abs(z.mean(axis=0)).max() < 0.15 + 3 / np.sqrt(60)
+    assert np.abs(z.std(axis=0) - 1.0).max() < 0.1 + 3 / np.sqrt(120)
+
+
 def test_what_hardly_ever_happens():
     """µ = 0.999: of 100 runs all met one value somewhere; a plain sample says so, a control knows what it misses."""
     scenario = sf.load_scenario("thesis-transient", steps=3)

@@ -86,6 +86,15 @@ def test_the_same_seed_gives_the_same_answer():
     np.testing.assert_allclose(one.values(), two.values(), rtol=1e-13)
 
 
+def test_many_agents_begin_with_few_runs():
+    """Far too many outcomes for an exact engine, and for a power of two of them in floating point."""
+    scenario = sf.load_scenario("thesis-transient", agents=40, steps=2)
+    found = sf.predict(scenario, [0.05], "monte-carlo", precision=0.05)
+    assert found.nature == "sampled"
+    assert found.sampled.runs == 25 < stopping.FIRST
+    assert found.meta["precision"]["reached"] < 0.05
+
+
 def test_an_exact_engine_is_used_where_that_is_easy():
     scenario = sf.load_scenario("thesis-transient", steps=2)
     found = sf.predict(scenario, [0.5], "monte-carlo", precision=0.001)

@@ -207,7 +207,7 @@ def _errors_of_naive(agents: int, steps: int, q: Fraction, r: Fraction, p0: Frac
 
 def test_the_squared_error_of_naive_fusion_is_that_of_every_outcome_by_hand():
     numbers = [Fraction(7), Fraction(90), Fraction(130)]
-    form = sf.derive_general(2, 3, *map(str, numbers), estimator="naive", quantity="rms", initial_error="-15/2")
+    form = sf.derive_general(2, 3, *map(str, numbers), estimator="naive").showing("rms", "-15/2")
     expected = _errors_of_naive(2, 3, *numbers, Fraction(-15, 2))
     assert list(form.bernstein) == [sympy.Rational(a.numerator, a.denominator) for a in expected]
 
@@ -223,26 +223,25 @@ def test_errors_as_formulas_are_those_that_are_predicted(quantity, architecture,
             "network": {"agents": 3, "steps": 2, "architecture": architecture},
         }
     )
-    error = {"initial_error": -10} if quantity == "rms" else {}
-    how = {"architecture": architecture, "correlation": start, "quantity": quantity} | error
-    found = float(sf.derive_general(3, 2, 7, 90, 130, **how).polynomial().eval(0.3))
+    form = sf.derive_general(3, 2, 7, 90, 130, architecture=architecture, correlation=start)
+    found = float(form.showing(quantity, -10 if quantity == "rms" else None).polynomial().eval(0.3))
     predicted = sf.predict(scenario, [0.3], "general", quantity).values()[0, -1]
     assert (found if quantity == "actual" else found**0.5) == pytest.approx(predicted, rel=1e-12)
 
 
 def test_symbols_of_the_squared_error_are_put_in_by_their_order():
-    form = sf.derive_general(2, 2, r=100, quantity="rms")
+    form = sf.derive_general(2, 2, r=100).showing("rms")
     assert [str(s) for s in form.symbols] == ["q", "p0", "b"]
-    numbers = sf.derive_general(2, 2, 25, 100, 64, quantity="rms", initial_error=-3)
+    numbers = sf.derive_general(2, 2, 25, 100, 64).showing("rms", -3)
     assert form.lambdify()(0.4, 25, 64, -3) == pytest.approx(float(numbers.polynomial().eval(0.4)), rel=1e-12)
 
 
 def test_what_a_quantity_is_refused_with():
     with pytest.raises(UsageError, match="quantity: expected one of claimed, actual, rms, got 'bias'"):
-        sf.derive_general(2, 2, quantity="bias")
+        sf.derive_general(2, 2).showing("bias")
     with pytest.raises(UsageError, match="quantity actual: expected formulation general or naive, got optimal"):
-        sf.derive_general(2, 2, estimator="optimal", quantity="actual")
+        sf.derive_optimal(2, 2).showing("actual")
     with pytest.raises(UsageError, match="initial_error: expected quantity rms, got actual"):
-        sf.derive_general(2, 2, quantity="actual", initial_error=1)
+        sf.derive_general(2, 2).showing("actual", 1)
     with pytest.raises(UsageError, match="initial_error: expected a number, got 'x'"):
-        sf.derive_general(2, 2, quantity="rms", initial_error="x")
+        sf.derive_general(2, 2).showing("rms", "x")
