@@ -56,7 +56,7 @@ def test_expectation_is_that_over_every_outcome(model, cut, monkeypatch):
         np.testing.assert_allclose(np.einsum("ir,rkiab->kiab", w, square), mean.square[0], rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", CASES.keys() - {"words"})
+@pytest.mark.parametrize("name", [name for name in CASES if name != "words"])
 def test_expectation_is_the_mean_of_what_is_drawn(name):
     """Whatever becomes of messages and measurements: by the numbers that were heard in outcomes drawn."""
     scenario = sf.Scenario.from_mapping(CASES[name])
