@@ -28,7 +28,7 @@ CORRELATIONS = ("independent", "shared")
 QUANTITIES = ("claimed", "actual", "rms")
 EXAMPLES = (
     "stochfuse derive simplified --agents 3 --step 2",
-    "stochfuse derive general --agents 2 --step 2 --q 25 --r 100 --p0 100 --quantity rms --latex",
+    "stochfuse derive general --agents 2 --step 2 --r 100 --quantity rms --latex",
 )
 Number = Annotated[str | None, option("A number, exact as typed; left out, a symbol.", SCENARIO, metavar="X")]
 

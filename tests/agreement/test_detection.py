@@ -217,6 +217,7 @@ def test_a_sample_agrees_within_its_error(estimator):
     assert (np.abs(sampled.values() - exact.values()) <= 4.5 * error + 1e-12).all()
 
 
+@pytest.mark.slow
 def test_bounds_hold_where_paths_are_too_many():
     for features in ((), ("several-states",)):
         source = featured.source(features)

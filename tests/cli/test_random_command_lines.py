@@ -426,6 +426,7 @@ def check(failures: dict[tuple[str, str], str], codes: Counter[int]) -> None:
     assert codes[3] > 0, codes
 
 
+@pytest.mark.slow
 def test_some_lines(folder):
     check(*walk(SEED, QUICK))
 

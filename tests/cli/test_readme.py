@@ -72,6 +72,7 @@ def folder(tmp_path_factory):
     return files(tmp_path_factory.mktemp("readme"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("command", "output"), shown(), ids=[c for c, _ in shown()])
 def test_console_examples(command, output, folder):
     assert execute(command, folder) == output
@@ -80,6 +81,7 @@ def test_console_examples(command, output, folder):
 PYTHON = re.compile(r"```python\n(.*?)```(?:\n\n```text\n(.*?)```)?", re.DOTALL)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("code", "output"), PYTHON.findall(everything()))
 def test_python_example(code, output, tmp_path):
     (tmp_path / "example.py").write_text(code)

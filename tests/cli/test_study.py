@@ -119,6 +119,7 @@ def test_the_schema_of_a_study():
     assert set(schema["properties"]) >= {"scenario", "vary", "design", "predict", "report"}
 
 
+@pytest.mark.slow
 def test_a_terminal_shows_a_bar_with_rate_and_remaining_time(tmp_path):
     """The bar goes to standard error, and leaves nothing behind."""
     many = STUDY.replace("[0, 0.5, 1]", "{from = 0, to = 1, number = 10_000}")

@@ -159,6 +159,7 @@ def test_chunks_are_the_whole_in_parts(tmp_path, parser, monkeypatch):
     assert np.array_equal(whole.number["z1"], z)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_file(tmp_path, parser, monkeypatch):
     monkeypatch.setattr(tables, "BLOCK", 50_000)
     peaks = []

@@ -34,6 +34,7 @@ def test_a_band_is_a_quantile():
     assert band(3, 7) == pytest.approx(tuple(chi2.ppf([0.025, 0.975], 21) / 7))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runs", [1, 3 * MANY])
 def test_intervals_keep_their_promise_where_errors_last(runs):
     """Errors that stay alike for some steps, and agents that have them in common: 95 % of averages lie within."""

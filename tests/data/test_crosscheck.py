@@ -42,6 +42,7 @@ def verdict(P, prediction, **kwargs):
     return check_results(results(P), prediction, metric("trace", prediction.scenario.model), **kwargs)
 
 
+@pytest.mark.slow
 def test_honest_samples_pass(samples, prediction):
     """30 samples of 1,000 runs: none may be called wrong (one in a hundred may; the level is one in a thousand)."""
     wrong = [not verdict(samples[:, i * 1000 : (i + 1) * 1000], prediction).agrees for i in range(30)]
@@ -61,6 +62,7 @@ def test_two_per_cent_in_one_cell_are_found(samples, prediction, cell):
     assert [(LINKS.index(c.link), c.step - 1) for c in found.cells if not c.agrees] == [cell]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [{"q": 25 * 1.02}, {"r": 98.0}, {"p0": 102.0}])
 def test_two_per_cent_in_the_simulators_noise_are_found(prediction, change):
     wrong = sf.load_scenario(steps=STEPS, **change)

@@ -128,6 +128,7 @@ def test_what_averages_do_not_say_is_sampled():
         )
 
 
+@pytest.mark.slow
 def test_a_known_first_error_is_expected():
     biased = {**SCENARIO, "initial": {**SCENARIO["initial"], "error": [3.0, -1.0]}}
     found = table(naive, LINKS, 1500, np.random.default_rng(4), error=(3.0, -1.0))

@@ -94,6 +94,7 @@ def test_nees_of_the_optimum_is_chi_squared():
             assert kstest(nis, chi2(int(stage.measured[0])).cdf).pvalue > 1e-4
 
 
+@pytest.mark.slow
 def test_nees_is_what_the_rules_consistency_predicts():
     """Of one state ε = (x̂ − x)²/P: naive fusion's average is E[actual given arrivals / claimed]."""
     s = sf.load_scenario("thesis-steady", steps=4)

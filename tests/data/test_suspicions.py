@@ -225,6 +225,7 @@ def test_other_units_are_as_likely_as_they_are():
 HONEST = ["cv-2d", "thesis-steady", "cooperative-pnt"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HONEST)
 def test_honest_records_are_hardly_ever_accused(name):
     assert sum(bool(told(name, drawn(name, seed))) for seed in range(30)) <= 1

@@ -53,6 +53,7 @@ def optimum_by_brute_force(F, Q, H, R, P0, n, steps, architecture, link, shared)
     return expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize(
     ("architecture", "agents", "steps"),

@@ -141,6 +141,7 @@ def ill(rng, d):
     return 0.5 * (P + P.T)
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(seeds, st.sampled_from([(1, 1), (1, 2), (2, 1), (2, 2), (4, 2), (3, 3)]))
 def test_no_mixture_in_a_batch_is_silently_wrong(seed, shape):
@@ -219,6 +220,7 @@ def some_case(seed):
     return case, float(rng.integers(2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["optimal", "general", "simplified"])
 @settings(max_examples=40)
 @given(seeds)

@@ -268,6 +268,7 @@ def test_steady_state_against_its_own_equation(mu):
     assert found.enclosure[0] <= mu <= found.enclosure[1]
 
 
+@pytest.mark.slow
 def test_steady_state_of_unlike_agents():
     """Agent 2 sees little by itself: with F = 1.2 it lives on what agent 1 sends it."""
     s = scenario(1.2, 1.0, 1.0, 1.0, 1.0, agents=2, steps=2, sensors=[{}, {"H": 1.0, "R": 1e4}])

@@ -178,6 +178,7 @@ ROUNDS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "suffix", "workers", "rounds"), ROUNDS)
 def test_kills_at_random_moments(name, suffix, workers, rounds, tmp_path, quiet, forked):
     expected, seconds = quiet[name, suffix]
@@ -370,6 +371,7 @@ class Handing:
         self.pool.shutdown(**named)
 
 
+@pytest.mark.slow
 def test_a_chunk_that_kills_its_worker_every_time_is_named(tmp_path, few, monkeypatch):
     output = tmp_path / "few.csv"
     message = "^a worker died at points 20 to 23, again when it was alone with them; what is finished is kept$"
@@ -460,6 +462,7 @@ def collected():
     gc.collect()
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_of_two_workers_one_of_which_is_killed(cluster, tmp_path, quiet, collected):
     assert with_one_killed(cluster, 2, tmp_path) == quiet["sampled", ".csv"][0]
 

@@ -415,6 +415,7 @@ def test_wrong_requests(arguments, message, tmp_path, monkeypatch):
     assert not done.stdout
 
 
+@pytest.mark.slow
 def test_everything_goes_into_a_directory(tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(plot, "save", lambda draw, path: drawn.append((draw.args[0].key, path.name)))
