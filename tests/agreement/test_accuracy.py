@@ -138,6 +138,7 @@ def test_the_form_is_chosen_by_conditioning():
     assert forms(1e-14) == ("square-root",)
 
 
+@pytest.mark.slow
 def test_a_hundred_steps_stay_symmetric_and_definite():
     s = sf.Scenario.from_mapping(mapping(F, Q, H, 25 * np.eye(2), P0, agents=50, steps=300))
     P = sf.predict(s, LINKS).covariance

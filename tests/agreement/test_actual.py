@@ -39,6 +39,7 @@ def oracle(name, estimator):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["local-fusion-graph", "naive"])
 @pytest.mark.parametrize("engine", ["merged", "plain", "monte-carlo"])
 @pytest.mark.parametrize("network", NETWORKS)

@@ -95,6 +95,7 @@ def test_any_terminal_width(columns):
         assert f"{value:#.5g}" in headings
 
 
+@pytest.mark.slow
 def test_a_steady_state_beside_what_is_exact():
     asked = ("predict", "--estimator", "naive", "--steps", "1", "--link", "0,0.5", "--runs", "30", "--steady")
     rows = list(csv.DictReader(io.StringIO(run(*asked, "-f", "csv").stdout)))

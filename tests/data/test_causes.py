@@ -163,6 +163,7 @@ def test_the_door_takes_cells_of_ones_own():
     assert "(the sum over agents)" in first.text
 
 
+@pytest.mark.slow
 def test_the_command_line_names_causes(tmp_path):
     """Expected at µ = 0.75 and sent as those of µ = 0.25."""
     rows = [(1, 43.9), (2, 24.6), (3, 22.0)]

@@ -132,6 +132,7 @@ def test_runs_may_have_names(tmp_path, parser):
         read_columns(written(tmp_path, "run\n12\nnorth\n"), FIELDS[:1])
 
 
+@pytest.mark.slow
 def test_chunks_are_the_whole_in_parts(tmp_path, parser, monkeypatch):
     """Blocks that end anywhere, with lines left out here and there."""
     rng = np.random.default_rng(1)

@@ -49,6 +49,7 @@ def test_honest_samples_pass(samples, prediction):
     assert sum(wrong) == 0
 
 
+@pytest.mark.slow
 def test_a_large_honest_sample_passes(samples, prediction):
     assert verdict(samples[:, :20_000], prediction).agrees
 
@@ -100,6 +101,7 @@ def part(columns, first, last):
     return read_results({name: column[some] for name, column in columns.items()})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("architecture", "agents", "link", "runs"),
     [("ad-hoc", 3, 0.98, 2), ("ad-hoc", 2, 0.98, 200), ("broadcast", 2, 0.02, 200), ("ad-hoc", 3, 0.005, 100), ("cyclic", 3, 0.99, 20)],

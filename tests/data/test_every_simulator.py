@@ -442,6 +442,7 @@ def test_quantities_stand_in_every_form(honest, tmp_path):
     assert max(map(len, command(*words).stdout.splitlines())) <= 80
 
 
+@pytest.mark.slow
 def test_figure(honest, tmp_path):
     found = sf.crosscheck(honest, SCENARIO)
     figure = found.plot()

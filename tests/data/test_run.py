@@ -350,6 +350,7 @@ def test_interrupted_it_leaves_no_file(made, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("preset", "estimators"),
     [("cv-2d", ["naive", "optimal"]), ("cooperative-pnt", ["lwin"]), ("gps-ins", ["equivalent-measurement"])],

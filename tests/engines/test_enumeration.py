@@ -278,6 +278,7 @@ def test_work_is_announced_before_it_starts():
     assert recorder.steps[-1][1] == recorder.steps[-1][2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("network", "settings", "message"),
     [

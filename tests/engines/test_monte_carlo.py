@@ -9,6 +9,7 @@ import stochfuse as sf
 from stochfuse.engines import monte_carlo
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("architecture", ["ad-hoc", "broadcast", "cyclic"])
 def test_the_sample_depends_on_the_seed_alone(architecture, monkeypatch):
     """Not on the number of processes, nor on whether equal histories are merged."""
@@ -33,6 +34,7 @@ def test_more_runs_of_a_seed_begin_with_the_fewer():
     np.testing.assert_allclose(many.values.P[many.which[:, :1000]], few.values.P[few.which], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_standard_errors_are_honest():
     """z-scores of 60 samples against the exact answer have mean 0 and variance 1; two-thirds of the intervals hold."""
     scenario = sf.load_scenario(steps=3)

@@ -247,6 +247,7 @@ def answers(scenario, method, mu, case):
         return
 
 
+@pytest.mark.slow
 def test_weights_of_intersections_are_optimal_to_fifty_digits_or_refused():
     """Pairs of very unlike size and condition; the criterion at the weight found against a search with mpmath."""
     rng = np.random.default_rng(7)

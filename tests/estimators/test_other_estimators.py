@@ -177,6 +177,7 @@ def test_against_every_history(case, estimator):
             close(shown.of_agent(agent + 1)[0], expected[:, agent])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("case", "estimator"), MATRIX)
 def test_nothing_merged(case, estimator):
     scenario, exact = scenario_of(case), oracle(case, estimator)
@@ -187,6 +188,7 @@ def test_nothing_merged(case, estimator):
     close(test_matrix.by_agent(without_errors, without_errors.covariance()), exact["claimed"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("case", "estimator"), MATRIX)
 def test_monte_carlo(case, estimator):
     exact = oracle(case, estimator)

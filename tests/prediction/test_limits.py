@@ -162,6 +162,7 @@ def test_an_error_without_a_variance_is_not_sampled():
         sf.predict(scenario, [0.5], method="monte-carlo", runs=10, steady=True)
 
 
+@pytest.mark.slow
 def test_what_does_not_settle_is_said():
     """Without process noise errors shrink for ever, as 1/k: two starts never agree."""
     source = strategies.mapping(1, 0, 1, 100, 100, 2, 2)

@@ -79,6 +79,7 @@ def assert_close(got, wanted, tolerance=1e-12):
     assert (np.abs(got - wanted) <= tolerance * scale).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["general", "naive", "optimal"])
 @pytest.mark.parametrize("case", CASES)
 def test_a_batch_is_its_items(case, method):

@@ -157,6 +157,7 @@ def test_any_target_within_reach_converges_to_1e_9(q, r, p0, n, steps, shared, s
     assert found.share == pytest.approx(float((zero - target) / (zero - one)), abs=1e-12 * float(zero / (zero - one)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("architecture", ["ad-hoc", "broadcast", "cyclic"])
 @pytest.mark.parametrize("method", ["simplified", "general", "naive", "optimal"])
 @pytest.mark.parametrize("of", ["trace", "det", "max-eig", "std:x2", "rms:x1,x2"])

@@ -120,6 +120,7 @@ def forward_chain(n, steps, link):
     return out
 
 
+@pytest.mark.slow
 def test_the_backward_walk_is_the_joint_chain():
     expected = forward_chain(3, 4, 0.35)
     found = message_load(scenario(steps=4), 0.35).by_step()[0]
@@ -478,6 +479,7 @@ def run(*arguments, code=0):
     return done
 
 
+@pytest.mark.slow
 def test_command():
     done = run("--steps", "12", "--from-step", "6", "--architecture", "broadcast", "--link", "0.25,0.5")
     assert done.stderr == ""

@@ -122,6 +122,7 @@ def extent(artist, renderer):
     return (super(Annotation, artist) if isinstance(artist, Annotation) else artist).get_window_extent(renderer)
 
 
+@pytest.mark.slow
 def test_nothing_is_cut_off(drawn):
     figure, renderer = drawn
     whole = figure.bbox

@@ -145,6 +145,7 @@ def chain(rng, n, p, r, good=1.0, bad=0.0):
     return out
 
 
+@pytest.mark.slow
 def test_memory_is_found_where_there_is_some_and_fitted(tmp_path):
     rng = np.random.default_rng(7)
     records = {

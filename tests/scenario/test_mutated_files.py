@@ -331,6 +331,7 @@ def test_study_values(examples):
     each(STUDIES, examples, check)
 
 
+@pytest.mark.slow
 def test_mutations_are_neither_harmless_nor_hopeless():
     """A good share passes the reading, so that what comes after it is tested too."""
     found = [

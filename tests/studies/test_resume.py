@@ -243,6 +243,7 @@ def test_ctrl_c_while_workers_start(tmp_path):
     assert (process.returncode, "Traceback" in err) == (130, False), err
 
 
+@pytest.mark.slow
 def test_two_commands_at_once(tmp_path, quiet):
     study, output = tmp_path / "mine.toml", tmp_path / "mine.csv"
     study.write_text(SAMPLED)
@@ -330,6 +331,7 @@ def few(tmp_path_factory):
     return output.read_bytes()
 
 
+@pytest.mark.slow
 def test_any_executor_does_the_work(tmp_path, few):
     with ThreadPoolExecutor(2) as threads:
         sf.study(FEW, tmp_path / "threads.csv", executor=threads)
@@ -497,6 +499,7 @@ def with_one_killed(cluster, workers, tmp_path):
     return content(output)
 
 
+@pytest.mark.slow
 def test_the_command_works_on_a_dask_cluster(cluster, tmp_path, quiet, collected):
     study, output = tmp_path / "mine.toml", tmp_path / "mine.parquet"
     study.write_text(SAMPLED)

@@ -130,6 +130,7 @@ def test_closed_forms_with_numbers_are_exact_rational_functions_of_mu():
     assert form.closed().subs(MU, sympy.Rational(1, 3)) == sympy.Rational(exact.numerator, exact.denominator)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("numbers", [{}, {"q": 25, "r": 100, "p0": 100}, {"r": 2}])
 def test_derivative_and_series(numbers):
     form = derive_simplified(3, 2, **numbers)
@@ -156,6 +157,7 @@ def test_fixed_point_equation_and_polynomial_hold_at_the_numeric_steady_state():
     assert abs(polynomial.as_expr().subs(at)) <= 1e-13 * scale
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(
     st.integers(1, 6),
