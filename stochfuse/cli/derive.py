@@ -20,12 +20,11 @@ from stochfuse.cli.options import (
     option,
 )
 from stochfuse.errors import UsageError
-from stochfuse.scenario.registry import GENERAL, LFG, NAIVE, OPTIMAL, SIMPLIFIED
+from stochfuse.scenario.registry import AS_FORMULAS, CLAIMED, GENERAL, LFG, NAIVE, OPTIMAL, SIMPLIFIED
 
 FORMULATIONS = (SIMPLIFIED, GENERAL, NAIVE, OPTIMAL)
 TEXT, LATEX, JSON = FORMATS = ("text", "latex", "json")
 CORRELATIONS = ("independent", "shared")
-QUANTITIES = ("claimed", "actual", "rms")
 EXAMPLES = (
     "stochfuse derive simplified --agents 3 --step 2",
     "stochfuse derive general --agents 2 --step 2 --r 100 --quantity rms --latex",
@@ -55,7 +54,7 @@ def derive(
     ] = "independent",
     quantity: Annotated[
         str | None,
-        choice(QUANTITIES, "Of general and naive: claimed, actual, or rms of the error; default: claimed.", SHOWN),
+        choice(AS_FORMULAS, "Of general and naive: claimed, actual, or rms of the error; default: claimed.", SHOWN),
     ] = None,
     initial_error: Annotated[
         str | None, option("Known error of all initial estimates, for rms; left out, b.", SCENARIO, metavar="X")
@@ -82,7 +81,7 @@ def derive(
     """
     from stochfuse.report.table import check_writable, terminal_width, to_json, write_text
 
-    if formulation in (SIMPLIFIED, OPTIMAL) and (quantity not in (None, "claimed") or initial_error is not None):
+    if formulation in (SIMPLIFIED, OPTIMAL) and (quantity not in (None, CLAIMED) or initial_error is not None):
         raise UsageError(f"--quantity and --initial-error: expected formulation general or naive, got {formulation}")
     if latex and format not in (None, LATEX):
         raise UsageError("--latex and --format: expected one of them, got both")
@@ -104,7 +103,7 @@ def derive(
         estimator = NAIVE if formulation == NAIVE else LFG
         start = correlation
         form = derive_general(agents, step, q, r, p0, architecture=architecture, correlation=start, estimator=estimator)
-        form = form.showing(quantity or QUANTITIES[0], initial_error)
+        form = form.showing(quantity or CLAIMED, initial_error)
     made = derivation.derivation(form)
     if latex or format == LATEX:
         text = derivation.to_latex(made)

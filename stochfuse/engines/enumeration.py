@@ -211,28 +211,28 @@ def _next_layer(
     total, progress, done = len(layer), listener(), 0
     for states, weights, exchanges in _in_parts(estimator, layer, possible, request):
         if exchanges is None:
-            for state, weight in zip(states, weights, strict=True):
-                exchange = state if request.plain else estimator.exchange(state)
-                for outcome in possible:
-                    if request.plain:
-                        after = exchange.onward(outcome.heard, outcome.late, outcome.missed)
-                    else:
-                        after, _ = exchange.after(outcome.heard, outcome.late, outcome.missed)
-                    new = times(weight, outcome.factor)
-                    known = found.get(after)
-                    found[after] = new if known is None else known + new
-                done += 1
-                progress.advance(f"step {step}", done, total)
-            continue
-        which, after = exchanges.after(np.array([outcome.heard for outcome in possible]))
-        for weight, numbers in zip(weights, which.tolist(), strict=True):
-            for outcome, number in zip(possible, numbers, strict=True):
+            followed = (_after(estimator, state, possible, request.plain) for state in states)
+        else:
+            which, after = exchanges.after(np.array([outcome.heard for outcome in possible]))
+            followed = ([after[number] for number in numbers] for numbers in which.tolist())
+        for weight, reached in zip(weights, followed, strict=True):
+            for outcome, state in zip(possible, reached, strict=True):
                 new = times(weight, outcome.factor)
-                known = found.get(after[number])
-                found[after[number]] = new if known is None else known + new
-        done += len(states)
-        progress.advance(f"step {step}", done, total)
+                known = found.get(state)
+                found[state] = new if known is None else known + new
+            done += 1
+            progress.advance(f"step {step}", done, total)
     return found
+
+
+def _after(estimator: Estimator, state: Any, possible: list[Outcome], plain: bool) -> Iterator[Any]:
+    """What a state becomes in every outcome, one by one."""
+    exchange = state if plain else estimator.exchange(state)
+    for outcome in possible:
+        if plain:
+            yield exchange.onward(outcome.heard, outcome.late, outcome.missed)
+        else:
+            yield exchange.after(outcome.heard, outcome.late, outcome.missed)[0]
 
 
 def _in_parts(

@@ -16,6 +16,7 @@ from stochfuse.explore.answers import Curve, Line, PageAnswer
 from stochfuse.explore.network import Picture
 from stochfuse.explore.state import FILE, PageInput
 from stochfuse.prediction.compare import EstimatorComparison
+from stochfuse.questions.messages import RULES
 from stochfuse.report import document
 from stochfuse.report.comparisons import EstimatorView, estimator_table
 from stochfuse.report.plot import COLORS, below, figure_class, titled
@@ -119,7 +120,7 @@ def _tables(asked: PageInput, shown: PageContents) -> list[Table]:
         title = ("What links are worth: the slope of the value in the probability of one link (simplified)",)
         found.append(Table(title, ("link",), ("µ", "dE/dµ", "perfect, to first order"), tuple(_worth(shown.picture))))
     if shown.load is not None:
-        rows = zip(("local-fusion-graph", "naive"), shown.load.value, strict=True)
+        rows = zip(RULES, shown.load.value, strict=True)
         cells = tuple((rule, *(number(value) for value in values)) for rule, values in rows)
         columns = tuple(f"k={k + 1}" for k in range(shown.load.value.shape[1]))
         found.append(Table((shown.load.text,), ("rule",), columns, cells))

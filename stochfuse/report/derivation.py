@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import sympy
 
 from stochfuse import __version__
-from stochfuse.scenario.registry import GENERAL, LFG, NAIVE, OPTIMAL, SIMPLIFIED
-from stochfuse.symbolic.general import CLAIMED, RMS, GeneralForm
+from stochfuse.scenario.registry import CLAIMED, GENERAL, LFG, NAIVE, OPTIMAL, RMS, SIMPLIFIED
+from stochfuse.symbolic.general import GeneralForm
 from stochfuse.symbolic.simplified import FIXED, MOST_AGENTS_CLEARED, MU, SimplifiedForm
 
 SCHEMA = "stochfuse.derivation/1"

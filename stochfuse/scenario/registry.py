@@ -297,6 +297,8 @@ ENGINES = tuple(e.name for e in ENGINE)
 METHODS = (SIMPLIFIED, GENERAL, CHAIN, OPTIMAL, NAIVE, MONTE_CARLO)
 """What --method takes: the engines, and the short forms."""
 QUANTITIES = tuple(q.name for q in QUANTITY)
+CLAIMED, ACTUAL, RMS = AS_FORMULAS = ("claimed", "actual", "rms")
+"""Quantities that there are as formulas."""
 INTERSECTIONS = tuple(e.name for e in ESTIMATOR if e.weighs)
 SUMS = tuple(e.name for e in ESTIMATOR if e.sums)
 

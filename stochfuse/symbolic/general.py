@@ -33,11 +33,10 @@ from stochfuse.kalman.algebra import FIELD
 from stochfuse.prediction.general import check_size
 from stochfuse.scenario.model import Model, Sensor
 from stochfuse.scenario.network import Network, uniform_rows
-from stochfuse.scenario.registry import LFG, OPTIMAL
+from stochfuse.scenario.registry import AS_FORMULAS, CLAIMED, LFG, OPTIMAL, RMS
 from stochfuse.symbolic.simplified import MU, P0, Q, R, exact_number
 
 B = sympy.Symbol("b", real=True)
-CLAIMED, ACTUAL, RMS = QUANTITIES = ("claimed", "actual", "rms")
 
 MOST_OUTCOMES = 2_000_000
 """Outcomes of the last exchanges, over all graphs, up to which they are gone through one by one."""
@@ -92,8 +91,8 @@ class GeneralForm:
         >>> sf.derive_general(2, 1, 25, 100, 100).showing("rms", -1000).closed()
         1000100 - 50*mu
         """
-        if quantity not in QUANTITIES:
-            raise UsageError(f"quantity: expected one of {', '.join(QUANTITIES)}, got '{quantity}'")
+        if quantity not in AS_FORMULAS:
+            raise UsageError(f"quantity: expected one of {', '.join(AS_FORMULAS)}, got '{quantity}'")
         if quantity != CLAIMED and self.estimator == OPTIMAL:
             raise UsageError(f"quantity {quantity}: expected formulation general or naive, got optimal")
         if quantity != RMS and initial_error is not None:
