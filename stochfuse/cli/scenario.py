@@ -231,7 +231,7 @@ def _written(
     names = [f"{v}{a}" for a in "xyz"[:n] for v in (("", "v") if moves else ("",))]
     units = [u for _ in range(n) for u in ((unit, f"{unit}/step") if moves else (unit,))]
     F = [[float(i == j or (moves and i % 2 == 0 and j == i + 1)) for j in range(d)] for i in range(d)]
-    G = [[(0.5, 1.0)[i % 2] if moves and i // 2 == j else float(i == j) for j in range(n)] for i in range(d)]
+    G = [[(0.5, 1.0)[i % 2] if i // 2 == j else 0.0 for j in range(n)] for i in range(d)]
     H = [[float(j == (2 * i if moves else i)) for j in range(d)] for i in range(n)]
     start = [
         [(100 * sigma**2 if not moves or i % 2 == 0 else 100 * noise**2 + 1) * (i == j) for j in range(d)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from importlib import import_module
 
+import numpy as np
 import pytest
 
 import stochfuse as sf
@@ -180,3 +181,13 @@ def test_steps_are_picked():
     header = run("predict", "--at", "1,last").stdout.splitlines()[4]
     assert header.split() == ["µ", "k=1", "k=5"]
     assert "--at: expected steps from 1 to 5, or last, got '6'" in run("predict", "--at", "6", code=2).stderr
+
+
+@pytest.mark.parametrize("axes", [1, 2, 3])
+def test_a_new_scenario_moves_alike_in_every_direction(tmp_path, axes):
+    path = str(tmp_path / "s.toml")
+    run("scenario", "new", "--model", "constant-velocity", "--axes", str(axes), "--noise", "0.5", "--output", path)
+    model = sf.load_scenario(path).model
+    each = 0.25 * np.array([[0.25, 0.5], [0.5, 1.0]])  # of an acceleration that stands for a step
+    np.testing.assert_allclose(model.Q, np.kron(np.eye(axes), each), rtol=1e-15)
+    np.testing.assert_array_equal(model.F, np.kron(np.eye(axes), [[1.0, 1.0], [0.0, 1.0]]))
