@@ -29,7 +29,7 @@ from stochfuse.fusion.cooperative import (
     together,
 )
 from stochfuse.kalman.checks import shown
-from stochfuse.scenario.checker import Checker
+from stochfuse.scenario.checker import Checker, tables_of
 
 
 class Relations(NamedTuple):
@@ -91,7 +91,7 @@ def read_cooperative(
     Relations or None
         None without [cooperative], or where something essential is wrong, which the checker has noted.
     """
-    nodes = [node if isinstance(node, dict) else {} for node in _listed(agent_tables)]
+    nodes = tables_of(agent_tables)
     if not isinstance(table, Mapping):
         placed = [i for i, node in enumerate(nodes, start=1) if node.get("position") is not None]
         if table is None and placed:
@@ -156,9 +156,7 @@ def _noises(
     common = _noise(check, "cooperative", table)
     noises: dict[tuple[int, int], Any] = dict.fromkeys(permutations(range(agents), 2), common)
     listed = set()
-    for k, pair in enumerate(_listed(table.get("pair")), start=1):
-        if not isinstance(pair, dict):
-            continue
+    for k, pair in enumerate(tables_of(table.get("pair")), start=1):
         path = f"cooperative.pair[{k}]"
         noise = _pair_noise(check, path, pair, d)
         ends = _ends(check, f"{path}.agents", pair.get("agents"), agents)
@@ -170,10 +168,6 @@ def _noises(
         listed |= ways
         noises.update(dict.fromkeys(ways, noise))
     return {pair: noise for pair, noise in noises.items() if noise is not None}
-
-
-def _listed(value: Any) -> Sequence[Any]:
-    return value if isinstance(value, list | tuple) else ()
 
 
 def _measures(table: Mapping[str, Any]) -> bool:
@@ -219,19 +213,11 @@ def _linear(check: Checker, path: str, pair: Mapping[str, Any], d: int) -> Relat
 
 
 def _noise(check: Checker, path: str, table: Mapping[str, Any]) -> _RelationNoise | None:
-    noise = _RelationNoise(*(_deviation(check, f"{path}.{key}", table.get(key)) for key in _RelationNoise._fields))
-    return noise if any(sigma is not None for sigma in noise) else None
-
-
-def _deviation(check: Checker, path: str, value: Any) -> float | None:
     expected = "a positive standard deviation"
-    array = check.array(path, value, expected)
-    if array is None:
-        return None
-    if array.ndim or array <= 0:
-        check.note(path, expected, shown(value))
-        return None
-    return float(array)
+    noise = _RelationNoise(
+        *(check.number(f"{path}.{key}", table.get(key), expected, lambda σ: σ > 0) for key in _RelationNoise._fields)
+    )
+    return noise if any(sigma is not None for sigma in noise) else None
 
 
 def _ends(check: Checker, path: str, value: Any, agents: int) -> tuple[int, int] | None:
@@ -248,7 +234,9 @@ def _ends(check: Checker, path: str, value: Any, agents: int) -> tuple[int, int]
     return first - 1, second - 1
 
 
-def _places(check: Checker, nodes: list[Any], coordinates: int, agents: int, steps: int) -> list[np.ndarray] | None:
+def _places(
+    check: Checker, nodes: Sequence[Mapping[str, Any]], coordinates: int, agents: int, steps: int
+) -> list[np.ndarray] | None:
     """Return every agent's place, (D,) or (steps, D)."""
     if len(nodes) != agents:
         # reading the sensors notes a wrong number of tables, but not that there are none
@@ -263,9 +251,8 @@ def _places(check: Checker, nodes: list[Any], coordinates: int, agents: int, ste
             continue
         if node.get("position") is None:
             check.note(path, f"a list of {coordinates} numbers, since [cooperative] is given", "nothing")
-        place = check.vector(path, node.get("position"), coordinates, steps)
-        if place is not None:
-            places.append(place[:steps, :, 0] if place.ndim == 3 else place[:, 0])
+        place = check.place(path, node.get("position"), coordinates, steps)
+        places += [] if place is None else [place]
     return places if len(places) == agents else None
 
 
