@@ -30,6 +30,7 @@ from stochfuse.estimators.protocol import Late
 from stochfuse.scenario.network import reachable
 from stochfuse.scenario.scenario import Scenario, load_scenario
 
+RUN, STEP = ColumnField("run", TEXT, required=False), ColumnField("step", WHOLE, 1)
 ALONE = ("1",)
 """Names of the runs where no file has any."""
 NUMBERS = 400_000
@@ -437,13 +438,7 @@ class _ScenarioReader:
         def fields(names: Sequence[str]) -> list[ColumnField]:
             z = [ColumnField(f"z{i}", blank=True, free=True, required=i == 1) for i in range(1, most + 1)]
             own = [ColumnField("of", TEXT, required=False, blank=True)] if self.scenario.relations else []
-            return [
-                ColumnField("run", TEXT, required=False),
-                ColumnField("step", WHOLE, 1),
-                ColumnField("agent", TEXT),
-                *own,
-                *z,
-            ]
+            return [RUN, STEP, ColumnField("agent", TEXT), *own, *z]
 
         found = self.columns(source, fields)
         agent = self._agent(found, "agent")
@@ -488,18 +483,8 @@ class _ScenarioReader:
         def fields(names: Sequence[str]) -> list[ColumnField]:
             ends = [ColumnField("receiver", TEXT), ColumnField("sender", TEXT)]
             if "step" not in names and "seq" in names:
-                return [
-                    ColumnField("run", TEXT, required=False),
-                    ColumnField("seq", WHOLE, 0),
-                    *ends,
-                    ColumnField("received", WHOLE, 0, required=False),
-                ]
-            return [
-                ColumnField("run", TEXT, required=False),
-                ColumnField("step", WHOLE, 1),
-                *ends,
-                ColumnField("sent_step", WHOLE, 1, required=False, blank=True),
-            ]
+                return [RUN, ColumnField("seq", WHOLE, 0), *ends, ColumnField("received", WHOLE, 0, required=False)]
+            return [RUN, STEP, *ends, ColumnField("sent_step", WHOLE, 1, required=False, blank=True)]
 
         found = self.columns(source, fields, empty=True)
         receiver, sender = self._agent(found, "receiver"), self._agent(found, "sender")
@@ -550,12 +535,7 @@ class _ScenarioReader:
                     f"truth: expected states as columns, some of {', '.join(states)}; got {', '.join(names)}"
                 )
             given = [ColumnField(state, blank=True) for state in shown]
-            return [
-                ColumnField("run", TEXT, required=False),
-                ColumnField("step", WHOLE, 1),
-                ColumnField("agent", TEXT, required=own),
-                *given,
-            ]
+            return [RUN, STEP, ColumnField("agent", TEXT, required=own), *given]
 
         found = self.columns(source, fields)
         self.known = np.array([states.index(state) for state in shown])
@@ -572,7 +552,7 @@ class _ScenarioReader:
     def first(self, source: Any) -> _RawTable:
         """First estimates: keys 0, agent."""
         states = self.scenario.model.states
-        given = [ColumnField("run", TEXT, required=False), ColumnField("agent", TEXT), *map(ColumnField, states)]
+        given = [RUN, ColumnField("agent", TEXT), *map(ColumnField, states)]
         found = self.columns(source, lambda _: given)
         agent = self._agent(found, "agent")
         values = np.stack([found.number[state] for state in states], axis=1)

@@ -34,8 +34,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stochfuse.data.robots import RobotRecord, seen, wrapped
+from stochfuse.data.robots import RobotRecord, seen
 from stochfuse.errors import UsageError
+from stochfuse.scenario.sensing import wrapped
 
 GROSS = 5.0
 BLOCK = 1.0

@@ -37,10 +37,11 @@ from typing import NamedTuple
 import numpy as np
 
 from stochfuse.data.robot_errors import BLOCK, ChannelNoises
-from stochfuse.data.robots import RobotRecord, moved, seen, wrapped
+from stochfuse.data.robots import RobotRecord, moved, seen
 from stochfuse.fusion.cooperative import lwin_update
 from stochfuse.kalman.algebra import NUMPY
 from stochfuse.kalman.kernel import Estimate, corrected, predict, update
+from stochfuse.scenario.sensing import wrapped
 
 ESTIMATORS = ("stand-alone", "naive", "covariance-intersection", "split-ci", "lwin", "itns")
 GATE = 40.0
