@@ -351,9 +351,7 @@ class _Diagnosis:
         fit = self.results.judge(Means([m for _, m in found], nothing, nothing), len(self.results.blocks))
         shown = ", ".join(f"{µ:.4g}" for µ, _ in found)
         whose = ", ".join(block.link or "given" for block in self.results.blocks)
-        mistake = Mistake(
-            WRONG_LINK, f"the links' probabilities are {{0}} where they should be {whose}", lambda _: iter(())
-        )
+        mistake = Mistake(WRONG_LINK, f"the links' probabilities are {{0}} where they should be {whose}")
         rows = uniform_rows([µ for µ, _ in found])
         means = trial.means(replace(self.base, rows=rows))
         apart = 0.0 if means is None else self.results.apart(means)
@@ -387,15 +385,13 @@ class _Diagnosis:
         )
         text = "the runs are not independent of each other, and tell no more than about {0} that are"
         shown = f"{min(effective):.3g}"
-        return _ClosestMistake(
-            (Mistake(DEPENDENT, text, lambda _: iter(())),), None, fit, min(effective), 1, 0.0, False, shown
-        )
+        return _ClosestMistake((Mistake(DEPENDENT, text),), None, fit, min(effective), 1, 0.0, False, shown)
 
     def _approximate(self, trial: _SimulatorTrials) -> _ClosestMistake | None:
         if self.prediction.nature not in ("approximate", "bound"):
             return None
         text = "nothing is wrong with the simulator: the prediction is approximate, and exact numbers are as the file's"
-        return trial.best((Mistake(APPROXIMATE, text, lambda _: iter(())),), [Variant(lambda _: self.base)])
+        return trial.best((Mistake(APPROXIMATE, text),), [Variant(lambda _: self.base)])
 
 
 class _SimulatorTrials:

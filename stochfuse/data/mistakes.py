@@ -61,12 +61,12 @@ class Mistake(NamedTuple):
     ----------
     name : as programs read it.
     text : what it is, in a line; {0} is the estimated number.
-    variants : ways to make it in a simulator.
+    variants : ways to make it in a simulator; none of what is found otherwise.
     """
 
     name: str
     text: str
-    variants: Callable[[Simulator], Iterator[Variant]]
+    variants: Callable[[Simulator], Iterator[Variant]] = lambda _: iter(())
 
 
 def _certain(simulator: Simulator, note: str = "") -> Variant:
