@@ -10,8 +10,7 @@ The reader says what it wants as `ColumnField`s, and gets NumPy columns that nee
 Everything else is refused with its place: "results.csv, line 7, column 'step': expected …, got …".  Lines of CSV and
 records of JSON and Parquet count from 1; rows of arrays and data frames from 0, as `iloc` does.
 
-Long files are read part by part, so that `read_chunks` needs no more memory for them than for short ones; how, and what
-separates cells and lines, is said in `stochfuse.data.tables`.
+Files are read part by part; how, and what separates cells and lines, is said in `stochfuse.data.tables`.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.data.tables import (
-    BATCH,
     LABEL,
     NUMBER,
     TEXT,
@@ -135,22 +133,6 @@ class Columns:
             return 0.0
         return 0.5 * 10.0 ** -max(len(text.partition(".")[2]) for text in texts)
 
-    def part(self, start: int, stop: int) -> Columns:
-        """Return some rows that follow each other."""
-        stop = min(stop, self.length)
-        first = int(np.searchsorted(self.starts, start, side="right")) - 1
-        last = int(np.searchsorted(self.starts, stop, side="left"))
-        starts = np.maximum(self.starts[first:last], start)
-        return replace(
-            self,
-            length=stop - start,
-            number={name: values[start:stop] for name, values in self.number.items()},
-            text={name: Labels(codes[start:stop], names) for name, (codes, names) in self.text.items()},
-            blank={name: mask[start:stop] for name, mask in self.blank.items()},
-            starts=starts - start,
-            firsts=self.firsts[first:last] + starts - self.starts[first:last],
-        )
-
 
 def read_columns(
     source: Any,
@@ -192,32 +174,11 @@ def read_columns(
     >>> found.number["step"], found.number["z1"]
     (array([1, 2]), array([0.5, nan]))
     """
-    return _joined(list(_parts(source, fields, renamed or {}, others, empty)))
-
-
-def read_chunks(
-    source: Any,
-    fields: Fields,
-    renamed: Mapping[str, str] | None = None,
-    *,
-    others: bool = True,
-    rows: int = BATCH,
-) -> Iterator[Columns]:
-    """Read a table in chunks of at most some rows, as `read_columns` does; memory is bounded but for JSON.
-
-    Codes of texts keep their meaning from chunk to chunk.
-    """
-    for part in _parts(source, fields, renamed or {}, others):
-        for start in range(0, part.length, rows):
-            yield part.part(start, start + rows)
-
-
-def _parts(source: Any, fields: Fields, renamed: Renamed, others: bool, empty: bool = False) -> Iterator[Columns]:
     with ExitStack() as stack:
-        yield from _parts_of(opened(source, stack), fields, renamed, others, empty)
+        return _joined(list(_parts(opened(source, stack), fields, renamed or {}, others, empty)))
 
 
-def _parts_of(table: OpenedTable, fields: Fields, renamed: Renamed, others: bool, empty: bool) -> Iterator[Columns]:
+def _parts(table: OpenedTable, fields: Fields, renamed: Renamed, others: bool, empty: bool) -> Iterator[Columns]:
     places, wanted, skipped = _matched(table, fields, renamed, others)
     known: dict[str, dict[str, int]] = {field.name: {} for field in wanted}
     kinds = {place: field.kind for place, field in zip(places, wanted, strict=True)}
