@@ -147,14 +147,9 @@ class Scenario:
         return {"schema": SCHEMA, **copy.deepcopy(dict(self.source))}
 
 
-def one_state(scenario: Scenario) -> bool:
-    """Whether all agents track the state of one model."""
-    return not scenario.own and not scenario.filters
-
-
 def require_one_state(scenario: Scenario, who: str) -> None:
     """Raise UsageError unless all agents track the state of one model."""
-    if not one_state(scenario):
+    if not scenario.system.one_state:
         what = "states of their own (model.own)" if scenario.own else "filters of their own"
         raise UsageError(f"{who}: expected agents that track one state by one model, got agents with {what}")
 
