@@ -9,7 +9,7 @@ Whether a link has a memory, and which two states explain it: `stochfuse.scenari
 Files are known by their headers: logs `seq,sender,receiver,received` or, of received packets alone,
 `seq,sender,receiver` (the numbers between a sender's first and last were sent; a counter of 16 bits may wrap);
 Mercator raw logs; k7 files of ratios; edge lists `receiver,sender,link`; matrices with the nodes' names in the first
-row and column, receivers downwards.  Arrow reads them (extra `study`).
+row and column, receivers downwards.  Arrow reads them where it is installed (extra `study`), else Python's own csv.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stochfuse.errors import Problem, ScenarioError, UsageError, nearest, needed
+from stochfuse.errors import Problem, ScenarioError, StochfuseError, UsageError, nearest, needed
 from stochfuse.scenario.link_memory import MEMORY as MEMORY
 from stochfuse.scenario.link_memory import memory_of
 from stochfuse.scenario.result import Result
@@ -248,7 +248,7 @@ def read_links(
     UsageError
         If the file is none of these; with line and column.
     StochfuseError
-        If pyarrow is not installed.
+        If it is Parquet, and pyarrow is not installed.
     """
     name, text, table = _opened(source)
     if table is None and text.lstrip("\ufeff").startswith("{"):
@@ -312,16 +312,20 @@ def _opened(source: str | Path) -> tuple[str, str, dict[str, list[Any]] | None]:
 
 def _table(name: str, text: str) -> dict[str, Any]:
     """Columns of text by their names."""
-    arrow, arrow_csv = _arrow("pyarrow"), _arrow("pyarrow.csv")
-    header = text.lstrip("\ufeff").partition("\n")[0].rstrip("\r")
+    text = text.lstrip("\ufeff")
+    header = text.partition("\n")[0].rstrip("\r")
     if len(header) > LONGEST_LINE:
         raise UsageError(f"{name}, line 1: expected a line of headings, got {len(header):,} letters")
     heads = [_one_line(head).strip('"') for head in header.split(",")]
     if len(set(heads)) < len(heads):
         raise UsageError(f"{name}, line 1: expected different headings, got {header[:80]}")
     try:
+        arrow, arrow_csv = _arrow("pyarrow"), _arrow("pyarrow.csv")
+    except StochfuseError:
+        return _by_csv(name, text, heads)
+    try:
         found = arrow_csv.read_csv(
-            io.BytesIO(text.lstrip("\ufeff").encode()),
+            io.BytesIO(text.encode()),
             read_options=arrow_csv.ReadOptions(column_names=heads, skip_rows=1, block_size=LONGEST_LINE * 16),
             convert_options=arrow_csv.ConvertOptions(
                 column_types=dict.fromkeys(heads, arrow.string()), strings_can_be_null=False
@@ -330,6 +334,14 @@ def _table(name: str, text: str) -> dict[str, Any]:
     except arrow.ArrowInvalid as error:
         raise UsageError(f"{name}{_torn(text, len(heads)) or f': {_one_line(str(error))[:160]}'}") from None
     return {head: found[head] for head in heads}
+
+
+def _by_csv(name: str, text: str, heads: list[str]) -> dict[str, Any]:
+    torn = _torn(text, len(heads))
+    if torn:
+        raise UsageError(f"{name}{torn}")
+    rows = [row for row in csv.reader(io.StringIO(text, newline="")) if row][1:]
+    return {head: np.array([row[i] for row in rows], dtype=str) for i, head in enumerate(heads)}
 
 
 def _torn(text: str, columns: int) -> str:
@@ -713,4 +725,4 @@ def _delays(source: str, table: Mapping[str, Any], step: float | None) -> tuple[
 
 
 def _arrow(name: str) -> Any:
-    return needed(name, "study", "files of links need")
+    return needed(name, "study", "Parquet files of links need")
