@@ -31,19 +31,10 @@ from stochfuse.fusion.cooperative import (
 from stochfuse.kalman.checks import shown
 from stochfuse.scenario.checker import Checker, tables_of
 
-
-class Relations(NamedTuple):
-    """The cooperative measurements of a network.
-
-    Parameters
-    ----------
-    positions : indices of the states that are the place; empty where nothing depends on it.
-    pairs : for observer i and other j, counted from 0, the relation over the full state: H_i, H_j of shape (p, d), or
-        (steps, p, d) where a place is given per step, and R (p, p).  An ordered pair that is left out measures nothing.
-    """
-
-    positions: tuple[int, ...]
-    pairs: dict[tuple[int, int], Relation]
+Relations = dict[tuple[int, int], Relation]
+"""What observer i measures of other j, counted from 0, over the full state: H_i, H_j of shape (p, d), or (steps, p, d)
+where a place is given per step, and R (p, p).  An ordered pair that is left out measures nothing.
+"""
 
 
 class _RelationNoise(NamedTuple):
@@ -102,11 +93,9 @@ def read_cooperative(
     if where is None:
         return None
     if noises and not any(isinstance(noise, _RelationNoise) and noise.kind for noise in noises.values()):
-        return Relations((), {pair: _related(noise, where, None, None) for pair, noise in noises.items()})
+        return {pair: _related(noise, where, None, None) for pair, noise in noises.items()}
     places = _places(check, nodes, len(where.positions), agents, steps)
-    if places is None:
-        return None
-    return Relations(where.positions, _relations(check, noises, places, where))
+    return None if places is None else _relations(check, noises, places, where)
 
 
 def _states(
@@ -156,7 +145,10 @@ def _noises(
     common = _noise(check, "cooperative", table)
     noises: dict[tuple[int, int], Any] = dict.fromkeys(permutations(range(agents), 2), common)
     listed = set()
-    for k, pair in enumerate(tables_of(table.get("pair")), start=1):
+    given = table.get("pair")
+    for k, pair in enumerate(given if isinstance(given, list | tuple) else (), start=1):
+        if not isinstance(pair, Mapping):
+            continue
         path = f"cooperative.pair[{k}]"
         noise = _pair_noise(check, path, pair, d)
         ends = _ends(check, f"{path}.agents", pair.get("agents"), agents)
@@ -261,7 +253,7 @@ def _relations(
     noises: Mapping[tuple[int, int], _RelationNoise | Relation],
     places: Sequence[np.ndarray],
     where: _StateIndices,
-) -> dict[tuple[int, int], Relation]:
+) -> Relations:
     related, refused = {}, set()
     for (i, j), noise in noises.items():
         if isinstance(noise, Relation) or not noise.kind:

@@ -555,4 +555,4 @@ def _relations(
     if not own:
         check.note("model.own", "true, since agents measure each other's own places", "false")
     found = read_cooperative(check, mapping.get("cooperative"), tables, model.states, network.agents, network.steps)
-    return {} if found is None else found.pairs
+    return found or {}
