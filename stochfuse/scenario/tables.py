@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from stochfuse.kalman.checks import shown
-from stochfuse.scenario.checker import Checker, tables_of
+from stochfuse.scenario.checker import Checker
 from stochfuse.scenario.model import Filter, Model, NoiseCorrelation, Sensor
 from stochfuse.scenario.motion import read_motion, read_step, refuse_keys_of_kinds
 from stochfuse.scenario.network import ARCHITECTURES, Network, mean_delivery, possible_senders
@@ -90,7 +90,10 @@ def _cases(
     """Read the alternatives, by name, and their bursts: what one does not say is as in the network."""
     cases: list[tuple[str, np.ndarray]] = []
     bursts: list[np.ndarray | None] = []
-    for i, case in enumerate(tables_of(table.get("case")), start=1):
+    given = table.get("case")
+    for i, case in enumerate(given if isinstance(given, list) else [], start=1):
+        if not isinstance(case, Mapping):
+            continue
         path = f"network.case[{i}]"
         own, bursty = link, burst
         if case.get("link") is not None:
