@@ -73,24 +73,28 @@ def _certain(simulator: Simulator, note: str = "") -> Variant:
     return Variant(lambda _: simulator, note=note)
 
 
-def _numbers(s: Simulator, make: Callable[[System, float], System]) -> Iterator[Variant]:
-    """Of a changed system, with an unknown factor: in the whole simulator, or where the filters alone have it."""
+def _system(s: Simulator, **changes: Any) -> Simulator:
+    return replace(s, system=replace(s.system, **changes))
 
-    def whole(log: float) -> Simulator:
-        return replace(s, system=make(s.system, float(np.exp(log))))
 
-    def believed(log: float) -> Simulator:
-        return replace(s, told=make(s.told or s.system, float(np.exp(log))))
+def _network(s: Simulator, **changes: Any) -> Simulator:
+    return _system(s, network=replace(s.system.network, **changes))
 
-    yield Variant(whole, SCALES, np.exp)
+
+def _rows(s: Simulator, **changes: Any) -> Simulator:
+    return replace(s, rows=replace(s.rows, **changes))
+
+
+def _systems(s: Simulator) -> Iterator[tuple[str, System, str]]:
+    """What a number may be wrong in, and which that is: the whole simulator, or what its filters alone are told."""
+    yield "system", s.system, ""
     if s.followed and s.estimator in SUMS:
-        yield Variant(believed, SCALES, np.exp, FILTERS)
+        yield "told", s.told or s.system, FILTERS
 
 
 def _changed(s: Simulator, make: Callable[[System], System]) -> Iterator[Variant]:
-    yield _certain(replace(s, system=make(s.system)))
-    if s.followed and s.estimator in SUMS:
-        yield _certain(replace(s, told=make(s.told or s.system)), FILTERS)
+    for where, system, note in _systems(s):
+        yield _certain(replace(s, **{where: make(system)}), note)
 
 
 def scaled(system: System, *, Q: float = 1.0, R: float = 1.0, P0: float = 1.0) -> System:
@@ -110,7 +114,12 @@ def scaled(system: System, *, Q: float = 1.0, R: float = 1.0, P0: float = 1.0) -
 
 
 def _scaled(s: Simulator, which: str) -> Iterator[Variant]:
-    return _numbers(s, lambda system, factor: scaled(system, **{which: factor}))
+    for where, system, note in _systems(s):
+
+        def of(log: float, where: str = where, system: System = system) -> Simulator:
+            return replace(s, **{where: scaled(system, **{which: float(np.exp(log))})})
+
+        yield Variant(of, SCALES, np.exp, note)
 
 
 def _concerned(s: Simulator) -> tuple[bool, ...]:
@@ -204,7 +213,7 @@ def _measured_first(s: Simulator) -> Iterator[Variant]:
 
 def _start(s: Simulator, shared: bool) -> Iterator[Variant]:
     if s.system.shared != shared and s.system.agents > 1:
-        yield _certain(replace(s, system=replace(s.system, shared=shared)))
+        yield _certain(_system(s, shared=shared))
 
 
 def _estimator(s: Simulator, name: str, unless: tuple[str, ...] = ()) -> Iterator[Variant]:
@@ -227,10 +236,6 @@ def _habit(s: Simulator, habit: str) -> Iterator[Variant]:
     }
     if fits[habit]:
         yield _certain(replace(s, habits=s.habits | {habit}))
-
-
-def _network(s: Simulator, **changes: Any) -> Simulator:
-    return replace(s, system=replace(s.system, network=replace(s.system.network, **changes)))
 
 
 def _delayed(s: Simulator) -> Iterator[Variant]:
@@ -270,21 +275,18 @@ def _agents(s: Simulator) -> Iterator[Variant]:
 def _links(s: Simulator, of: Callable[[np.ndarray], np.ndarray]) -> Iterator[Variant]:
     if s.system.agents > 1 and s.rows.bursts is None:
         there = s.rows.link > 0 if s.rows.link.ndim > 2 else np.ones(1, dtype=bool)
-        yield _certain(replace(s, rows=replace(s.rows, link=np.where(there, of(s.rows.link), s.rows.link))))
+        yield _certain(_rows(s, link=np.where(there, of(s.rows.link), s.rows.link)))
 
 
 def _turned(s: Simulator) -> Iterator[Variant]:
     if not s.rows.uniform:
-        yield _certain(replace(s, rows=replace(s.rows, link=np.swapaxes(s.rows.link, -1, -2))))
+        yield _certain(_rows(s, link=np.swapaxes(s.rows.link, -1, -2)))
 
 
 def _scaled_links(s: Simulator) -> Iterator[Variant]:
     if not s.rows.uniform and s.rows.bursts is None:
-
-        def of(log: float) -> Simulator:
-            return replace(s, rows=replace(s.rows, link=np.minimum(1.0, s.rows.link * np.exp(log))))
-
-        yield Variant(of, tuple(np.log([0.25, 0.5, 0.8, 1.25, 2.0])), np.exp)
+        grid = tuple(np.log([0.25, 0.5, 0.8, 1.25, 2.0]))
+        yield Variant(lambda log: _rows(s, link=np.minimum(1.0, s.rows.link * np.exp(log))), grid, np.exp)
 
 
 def _silent_at_first(s: Simulator) -> Iterator[Variant]:
@@ -293,7 +295,7 @@ def _silent_at_first(s: Simulator) -> Iterator[Variant]:
     rows, steps = s.rows, s.system.steps
     every = rows.link.copy() if rows.varies else np.repeat(rows.link[:, None], steps, axis=1)
     every[:, 0] = 0.0
-    yield _certain(replace(s, rows=replace(rows, link=every)))
+    yield _certain(_rows(s, link=every))
 
 
 def with_memory(rows: LinkRows, memory: float) -> LinkRows:
@@ -345,7 +347,7 @@ def _no_bursts(s: Simulator) -> Iterator[Variant]:
     if s.rows.bursts is not None:
         pairs = zip(s.rows.link, s.rows.bursts, strict=True)
         link = np.array([µ if b is None else np.where(µ > 0, mean_delivery(b), 0.0) for µ, b in pairs])
-        yield _certain(replace(s, rows=replace(s.rows, link=link, bursts=None)))
+        yield _certain(_rows(s, link=link, bursts=None))
 
 
 def _shown(s: Simulator, *some: Shown, note: str = "") -> Iterator[Variant]:
@@ -423,14 +425,14 @@ def _no_noise(s: Simulator) -> Iterator[Variant]:
 
 def _other_error(s: Simulator, of: Callable[[np.ndarray], np.ndarray | None]) -> Iterator[Variant]:
     if s.followed and s.system.error is not None and s.system.error.any():
-        yield _certain(replace(s, system=replace(s.system, error=of(s.system.error))))
+        yield _certain(_system(s, error=of(s.system.error)))
 
 
 def _with_error(s: Simulator) -> Iterator[Variant]:
     if s.followed and s.system.dimension == 1 and s.system.one_state:
         deviation = np.sqrt(s.system.P0)
         yield Variant(
-            lambda at: replace(s, system=replace(s.system, error=at * deviation)),
+            lambda at: _system(s, error=at * deviation),
             (-10.0, -3.0, -1.0, -0.3, 0.3, 1.0, 3.0, 10.0),
             lambda at: at * float(deviation[0, 0]),
         )
