@@ -122,6 +122,11 @@ class Columns:
         where = f"{self.source}, {self.what} {self.line(row)}"
         return f"{where}, column '{column}'" if column else where
 
+    def said(self, row: int, column: str) -> str:
+        """Return what a cell of a column of texts says, in quotation marks."""
+        codes, names = self.text[column]
+        return f"'{names[codes[row]]}'"
+
     def error(self, row: int, column: str, expected: str, got: object) -> ColumnsError:
         """Return the error of a cell that a reader cannot use."""
         return ColumnsError(f"{self.at(row, column)}: expected {expected}, got {got}")
@@ -207,7 +212,7 @@ def _parts(table: OpenedTable, fields: Fields, renamed: Renamed, others: bool, e
 
 def _nothing(table: OpenedTable, wanted: Sequence[ColumnField], skipped: tuple[str, ...]) -> Columns:
     """No rows, but with headings."""
-    number = {field.name: np.zeros(0) for field in wanted if field.kind != TEXT}
+    number = {f.name: np.zeros(0, float if f.kind == NUMBER else np.int64) for f in wanted if f.kind != TEXT}
     text = {field.name: Labels(np.zeros(0, dtype=np.int32), ()) for field in wanted if field.kind == TEXT}
     none = np.zeros(0, dtype=np.int64)
     return Columns(table.name, 0, number, text, {}, {}, skipped, table.what, none, none)

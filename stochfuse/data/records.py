@@ -452,18 +452,14 @@ class _ScenarioReader:
         for row in np.flatnonzero(of >= 0).tolist():
             relation = self.scenario.relations.get((int(agent[row]), int(of[row])))
             if relation is None:
-                raise found.error(
-                    row, "of", "an agent that the scenario lets it measure", f"'{self._said(found, 'of', row)}'"
-                )
+                raise found.error(row, "of", "an agent that the scenario lets it measure", found.said(row, "of"))
             expected[row] = relation.R.shape[-1]
         blind = expected == 0
         if (blind & ~np.isnan(values).all(axis=1)).any():
             row = int((blind & ~np.isnan(values).all(axis=1)).argmax())
-            raise found.error(
-                row, "agent", "an agent with a sensor", f"'{self._said(found, 'agent', row)}' without one"
-            )
+            raise found.error(row, "agent", "an agent with a sensor", f"{found.said(row, 'agent')} without one")
         self._check_width(found, values, expected, z)
-        step = found.number["step"].astype(np.int64) - 1
+        step = found.number["step"] - 1
         early = int((~np.isnan(values[:, 0]) & (step == 0)).sum())
         where = np.stack([step, agent, of], axis=1)
         notes = []
@@ -490,14 +486,14 @@ class _ScenarioReader:
         receiver, sender = self._agent(found, "receiver"), self._agent(found, "sender")
         notes, there = [], np.ones(len(found), dtype=bool)
         if "seq" in found:
-            seq = found.number["seq"].astype(np.int64)
+            seq = found.number["seq"]
             begins = int(seq.min(initial=1))
             step = seq - begins
             notes.append(f"{found.source}: a packet log; packet {begins} is taken for step 1's")
             there = found.number["received"] != 0 if "received" in found else there
             sent = step
         else:
-            step = found.number["step"].astype(np.int64) - 1
+            step = found.number["step"] - 1
             sent = step
             if "sent_step" in found:
                 told = found.number["sent_step"]
@@ -542,7 +538,7 @@ class _ScenarioReader:
         agent = self._agent(found, "agent") if "agent" in found else np.full(len(found), -1)
         values = np.stack([found.number[state] for state in shown], axis=1)
         self._check_size(found, values, shown, "a number or nothing")
-        step = found.number["step"].astype(np.int64) - 1
+        step = found.number["step"] - 1
         notes = []
         if len(shown) < len(states):
             lost = ", ".join(state for state in states if state not in shown)
@@ -572,10 +568,6 @@ class _ScenarioReader:
     def _width(self, agent: int) -> int:
         return self.scenario.sensors[self.scenario.sensor_of[agent]].H.shape[-2]
 
-    def _said(self, found: Columns, column: str, row: int) -> str:
-        codes, names = found.text[column]
-        return names[codes[row]]
-
     def _agent(self, found: Columns, column: str, blank: bool = False) -> np.ndarray:
         """Agents by number from 0; −1 where a cell is empty."""
         codes, names = found.text[column]
@@ -586,8 +578,8 @@ class _ScenarioReader:
             row, n = int(wrong.argmax()), self.scenario.network.agents
             known = self.scenario.network.names
             listed = f", or {', '.join(known[:6])}{', …' if len(known) > 6 else ''}" if known else ""
-            said = self._said(found, column, row)
-            raise found.error(row, column, f"an agent from 1 to {n}{listed}", f"'{said}'{nearest(said, known)}")
+            said = found.said(row, column)
+            raise found.error(row, column, f"an agent from 1 to {n}{listed}", said + nearest(said[1:-1], known))
         return out
 
     def _check_size(self, found: Columns, values: np.ndarray, names: Sequence[str], expected: str) -> None:
@@ -614,9 +606,7 @@ class _ScenarioReader:
     ) -> None:
         if (receiver == sender).any():
             row = int((receiver == sender).argmax())
-            raise found.error(
-                row, "receiver", "another agent than the sender", f"'{self._said(found, 'receiver', row)}'"
-            )
+            raise found.error(row, "receiver", "another agent than the sender", found.said(row, "receiver"))
         if (sent > step).any():
             row = int((sent > step).argmax())
             raise found.error(row, "sent_step", f"a step up to {step[row] + 1}", sent[row] + 1)
@@ -627,11 +617,14 @@ class _ScenarioReader:
         codes, names = found.text["run"]
         return Labels(codes[kept], names)
 
+    def _by_run(self, found: Columns, keys: np.ndarray) -> np.ndarray:
+        """Keys with the number of the run before them."""
+        runs = found.text["run"].codes[:, None] if "run" in found else np.zeros((len(found), 1), dtype=np.int64)
+        return np.concatenate([runs, keys], axis=1)
+
     def _again(self, found: Columns, keys: np.ndarray, order: np.ndarray) -> np.ndarray:
         """Rows that have the keys of one before them, in some order of rows."""
-        runs = found.text["run"].codes[:, None] if "run" in found else np.zeros((len(found), 1), dtype=np.int64)
-        table = np.concatenate([runs, keys], axis=1)[order]
-        first = np.unique(table, axis=0, return_index=True)[1]
+        first = np.unique(self._by_run(found, keys)[order], axis=0, return_index=True)[1]
         again = np.ones(len(found), dtype=bool)
         again[order[first]] = False
         return again
@@ -642,8 +635,7 @@ class _ScenarioReader:
         """Rows that are there, each once; two that say different things of the same are an error."""
         again = self._again(found, where, np.arange(len(found)))
         if again.any():
-            runs = found.text["run"].codes[:, None] if "run" in found else np.zeros((len(found), 1), dtype=np.int64)
-            _, of = np.unique(np.concatenate([runs, where], axis=1), axis=0, return_inverse=True)
+            _, of = np.unique(self._by_run(found, where), axis=0, return_inverse=True)
             firsts = np.zeros(of.max() + 1, dtype=np.int64)
             firsts[of[~again]] = np.flatnonzero(~again)
             other = firsts[of.ravel()]
