@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,12 @@ class Checker:
         """Remember one problem, unless something is known to be wrong there already."""
         if path not in self._skip and all(problem.path != path for problem in self.problems):
             self.problems.append(Problem(path, expected, got))
+
+    def absent(self, path: str, table: Mapping[str, Any], keys: Iterable[str], expected: str) -> None:
+        """Note keys of a table that must not be given."""
+        for key in keys:
+            if table.get(key) is not None:
+                self.note(f"{path}.{key}", expected, shown(table[key]))
 
     def array(self, path: str, value: Any, expected: str) -> np.ndarray | None:
         """Any array of finite floats."""

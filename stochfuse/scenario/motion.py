@@ -217,9 +217,7 @@ def read_motion(check: Checker, table: Mapping[str, Any], steps: int) -> Motion 
         None where something is wrong, which the checker has noted.
     """
     kind = check.choice("model.kind", table.get("kind"), tuple(ORDERS))
-    for key in ("F", "Q", "G"):
-        if table.get(key) is not None:
-            check.note(f"model.{key}", "nothing, since model.kind gives F and Q", shown(table[key]))
+    check.absent("model", table, ("F", "Q", "G"), "nothing, since model.kind gives F and Q")
     axes = _axes(check, kind, table.get("axes", 2))
     T = read_step(check, table, steps)
     noise_kind = check.choice("model.noise_kind", table.get("noise_kind", NOISES[0]), NOISES)
@@ -238,13 +236,6 @@ def read_motion(check: Checker, table: Mapping[str, Any], steps: int) -> Motion 
         states=tuple(BEFORE[order] + axis for axis in AXES[:axes] for order in orders),
         units=tuple(UNITS[order] for _ in range(axes) for order in orders),
     )
-
-
-def refuse_keys_of_kinds(check: Checker, table: Mapping[str, Any]) -> None:
-    """Note keys of [model] that say nothing without a kind."""
-    for key in KEYS:
-        if table.get(key) is not None:
-            check.note(f"model.{key}", "nothing without model.kind", shown(table[key]))
 
 
 def _axes(check: Checker, kind: str | None, value: Any) -> int | None:

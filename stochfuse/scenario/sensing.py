@@ -419,7 +419,7 @@ def read_named(
     given = _SensingContext(layout, course, model, steps, table.get("nominal") is not None, own)
     default = None
     if common:
-        _refuse(check, "model", table, ("H", "R"), "nothing beside a sensor by name")
+        check.absent("model", table, ("H", "R"), "nothing beside a sensor by name")
         default = _read(check, "model.sensor", common, given)
     if common and not tables:
         return Named({0: None if default is None else _placed(check, "agent", None, default, given)}, given.path)
@@ -427,25 +427,19 @@ def read_named(
     for i, agent in enumerate(tables):
         path = f"agent[{i + 1}]"
         if i in named:
-            _refuse(check, path, agent, ("H", "R"), "nothing beside a sensor by name")
+            check.absent(path, agent, ("H", "R"), "nothing beside a sensor by name")
             sensor = _read(check, f"{path}.sensor", agent["sensor"], given)
         elif common and agent.get("sensor") is not False and not {"H", "R"} & set(agent):
             sensor = default
         else:
             _place(check, path, agent.get("position"), given)
             continue
-        _refuse(check, path, agent, ("F", "M", "s"), MODEL_STATES)
+        check.absent(path, agent, ("F", "M", "s"), MODEL_STATES)
         found[i] = None if sensor is None else _placed(check, path, agent.get("position"), sensor, given)
     return Named(found, given.path)
 
 
 MODEL_STATES = "nothing beside a sensor by name, which measures the model's states; or H and R instead of it"
-
-
-def _refuse(check: Checker, path: str, table: Mapping[str, Any], keys: Sequence[str], expected: str) -> None:
-    for key in keys:
-        if table.get(key) is not None:
-            check.note(f"{path}.{key}", expected, shown(table[key]))
 
 
 def _read(check: Checker, path: str, table: Mapping[str, Any], given: _SensingContext) -> _Read | None:

@@ -14,7 +14,7 @@ import numpy as np
 from stochfuse.kalman.checks import shown
 from stochfuse.scenario.checker import Checker
 from stochfuse.scenario.model import Filter, Model, NoiseCorrelation, Sensor
-from stochfuse.scenario.motion import read_motion, read_step, refuse_keys_of_kinds
+from stochfuse.scenario.motion import KEYS, read_motion, read_step
 from stochfuse.scenario.network import ARCHITECTURES, Network, mean_delivery, possible_senders
 from stochfuse.scenario.radio import links_between, read_places, read_radio
 from stochfuse.scenario.sensing import sometimes
@@ -333,7 +333,7 @@ def read_model(check: Checker, table: Mapping[str, Any], steps: int) -> tuple[Mo
 
 def _matrices(check: Checker, table: Mapping[str, Any], steps: int) -> tuple[np.ndarray | None, np.ndarray | None]:
     """F, and Q as it enters the state, of a model that is written out."""
-    refuse_keys_of_kinds(check, table)
+    check.absent("model", table, KEYS, "nothing without model.kind")
     read_step(check, table, steps)
     F = check.matrix("model.F", table.get("F"), None, None, steps)
     if F is not None and F.shape[-1] != F.shape[-2]:
@@ -411,8 +411,7 @@ def read_sensors(
             sensor = named[i - 1]
         elif table.get("sensor") is False:
             sensor = Sensor(np.zeros((0, size or 1)), np.zeros((0, 0)))
-            for key in {"H", "R"} & set(table):
-                check.note(f"{path}.{key}", "nothing, since sensor = false", shown(table[key]))
+            check.absent(path, table, ("H", "R"), "nothing, since sensor = false")
         else:
             # the model's sensor is for filters that have as many states as the model
             fitting = default if default is None or default.H.shape[-1] == size else None
