@@ -16,7 +16,7 @@ results beside the prediction and says what would explain a difference.
     cells, together           each cell judged, and all of them
     crosscheck                the verdict
     mistakes, supposed        mistakes that people make, and what a simulator with one would show
-    blocks, fits, causes      which of them explains a verdict that disagrees
+    fits, causes              which of them explains a verdict that disagrees
     agent, knowledge          a live agent; what it knows, forgets and makes of it
     messages, protocols       what agents say, in bytes; load and accuracy of messages that do not carry everything
 

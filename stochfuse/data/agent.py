@@ -20,7 +20,7 @@ from __future__ import annotations
 import json
 import secrets
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any, NamedTuple
 
@@ -56,6 +56,19 @@ class Start(NamedTuple):
     step: int = 1
     x: Any = None
     P: Any = None
+
+
+class _Facts(NamedTuple):
+    """What is saved of an agent besides nodes; what it has seen, where it does not hand them on."""
+
+    agent: int
+    estimator: str
+    criterion: str
+    protocol: Mapping[str, Any]
+    now: int
+    begun: int
+    waived: list[list[int]]
+    seen: list[list[Any]] | None = None
 
 
 class Agent:
@@ -283,23 +296,19 @@ class Agent:
         """Return all that it needs to go on from here; see `load`."""
         knows, kind = self._knows, self._saved_kind()
         nodes = [knows.own, *(node for name, node in knows.nodes.items() if name != knows.own.name)]
-        facts: dict[str, Any] = {
-            "agent": self.number,
-            "estimator": self.estimator,
-            "criterion": self.criterion,
-            "protocol": asdict(self.protocol),
-            "now": knows.now,
-            "begun": knows.begun,
-            "waived": [[*life, step] for life, step in sorted(knows.waived.items())],
-        }
         for place, (vector, (step, information)) in enumerate(sorted(knows.worth.items(), key=lambda item: item[0])):
             # as a node of nobody's, one step later than what it rests on
             nobody = Life(self.scenario.network.agents, place)
             known = {**dict(vector), nobody: step + 1}
             nodes.append(Node(nobody, step + 1, known, information.y, (information.Y,)))
+        waived = [[*life, step] for life, step in sorted(knows.waived.items())]
+        seen = None
         if isinstance(knows, Latest):
-            facts["seen"] = [[*life, sorted(steps)] for life, steps in sorted(knows.seen.items())]
-        head = json.dumps(facts, separators=(",", ":")).encode()
+            seen = [[*life, sorted(steps)] for life, steps in sorted(knows.seen.items())]
+        protocol = asdict(self.protocol)
+        facts = _Facts(self.number, self.estimator, self.criterion, protocol, knows.now, knows.begun, waived, seen)
+        told = {name: value for name, value in facts._asdict().items() if value is not None}
+        head = json.dumps(told, separators=(",", ":")).encode()
         whole = SAVED + len(head).to_bytes(4, "little") + head + encode(nodes, kind)
         return whole + zlib.crc32(whole).to_bytes(4, "little")
 
@@ -322,13 +331,13 @@ class Agent:
             raise MessageError("saved agent: expected what Agent.save returned, got other or damaged bytes")
         end = 8 + int.from_bytes(whole[4:8], "little")
         try:
-            facts = json.loads(whole[8:end])
-            protocol, criterion = MessageProtocol(**facts["protocol"]), facts["criterion"]
-            name = facts["estimator"] if estimator is None else estimator_named(estimator)
-            if name != facts["estimator"] or (estimator is None and name not in registry.ESTIMATORS):
+            facts = _Facts(**json.loads(whole[8:end]))
+            protocol, criterion = MessageProtocol(**facts.protocol), facts.criterion
+            name = facts.estimator if estimator is None else estimator_named(estimator)
+            if name != facts.estimator or (estimator is None and name not in registry.ESTIMATORS):
                 got = "none" if estimator is None else f"'{name}'"
-                raise MessageError(f"saved agent: expected estimator '{facts['estimator']}' to be given, got {got}")
-            agent = cls(scenario, facts["agent"], name, protocol=protocol, criterion=criterion)
+                raise MessageError(f"saved agent: expected estimator '{facts.estimator}' to be given, got {got}")
+            agent = cls(scenario, facts.agent, name, protocol=protocol, criterion=criterion)
             try:
                 nodes = decode(whole[end:], agent._saved_kind())
             except MessageError:
@@ -338,13 +347,13 @@ class Agent:
             raise MessageError(f"saved agent: expected what Agent.save returned, got other facts: {error}") from None
         return agent
 
-    def _restore(self, facts: dict[str, Any], nodes: list[Node]) -> None:
+    def _restore(self, facts: _Facts, nodes: list[Node]) -> None:
         knows = self._knows
         knows.life = Life(self._setting.agent, secrets.randbelow(2**32 - 1) + 1)
-        knows.now, knows.begun, knows.own = facts["now"], facts["begun"], nodes[0]
-        knows.waived = {Life(agent, number): step for agent, number, step in facts["waived"]}
+        knows.now, knows.begun, knows.own = facts.now, facts.begun, nodes[0]
+        knows.waived = {Life(agent, number): step for agent, number, step in facts.waived}
         if isinstance(knows, Latest):
-            knows.seen = {Life(agent, number): set(steps) for agent, number, steps in facts["seen"]}
+            knows.seen = {Life(agent, number): set(steps) for agent, number, steps in facts.seen or ()}
             nodes = nodes[1:]
         nobody = self.scenario.network.agents
         knows.nodes = {node.name: node for node in nodes if node.life.agent != nobody}

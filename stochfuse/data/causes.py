@@ -31,13 +31,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from stochfuse.data.blocks import blocks_behind
+from stochfuse.data.cells import Cell, Judged
 from stochfuse.data.fits import ROUNDING, Fit, Fits, Means, covariance_of
 from stochfuse.data.mistakes import DEPENDENT, MISTAKES, WRONG_LINK, Mistake, Variant
-from stochfuse.data.supposed import CLAIMED, ERROR, SQUARED, CellMean, LinkMeans, Sampler, Simulator, exactly
+from stochfuse.data.supposed import CLAIMED, ERROR, SQUARED, LinkMeans, Sampler, Simulator, exactly
 from stochfuse.engines.distribution import Distribution
 from stochfuse.engines.progress import listener
 from stochfuse.errors import StochfuseError
+from stochfuse.kalman.metrics import metric as metric_of
 from stochfuse.prediction.result import Prediction
 from stochfuse.scenario.network import LinkRows, uniform_rows
 from stochfuse.scenario.registry import BROADCAST_PRIOR, LFG
@@ -61,6 +62,8 @@ LINKS, CELLS, STEPS = 4, 60, (8, 8, 4, 3)
 BETTER, SPREAD, CLOSE = 6.0, 40.0, 0.01
 """Least gain in T² over a right simulator, most by which the spread of the runs may be worse than another mistake's,
 and gain in T² that ends a search."""
+COMPLETE = 0.5
+"""Share of runs with a value in every cell from which on the runs are taken, and not their means alone."""
 DIFFERENT = 0.95
 """Share of runs with noise of their own below which runs are repeated."""
 APPROXIMATE = "approximate-prediction"
@@ -165,17 +168,40 @@ def _fewer(prediction: Prediction, rows: LinkRows, blocks: Sequence[LinkMeans]) 
     return chosen, prediction.scenario.until(last).system, Fits(tuple(block for block in found if block.cells))
 
 
-def causes_of(verdict: Verdict, rows: LinkRows) -> tuple[Cause, ...]:
+def causes_of(verdict: Verdict, judged: Sequence[Judged], rows: LinkRows) -> tuple[Cause, ...]:
     """Say what would explain a verdict that disagrees; empty where it agrees, or does not for its evidence alone.
 
     Parameters
     ----------
+    judged : its cells, with the runs behind them.
     rows : links that its prediction was asked for.
     """
     level = verdict.alpha if verdict.p_together is None else verdict.alpha / 2
     if verdict.p_largest > level and (verdict.p_together is None or verdict.p_together > level):
         return ()
-    return diagnose(verdict.prediction, rows, blocks_behind(verdict), alpha=verdict.alpha)
+    return diagnose(verdict.prediction, rows, _blocks(judged), alpha=verdict.alpha)
+
+
+def _blocks(judged: Sequence[Judged]) -> list[LinkMeans]:
+    """Cells of every link probability, of the first steps or the first one there is, with what each run has."""
+    last = max(STEPS[0], min((j.cell.step for j in judged), default=0))
+    found = []
+    for row in sorted({j.cell.row for j in judged}):
+        mine = [j for j in judged if j.cell.row == row and j.cell.step <= last and np.isfinite(j.cell.mean)]
+        if mine:
+            cells = (j.cell if np.isfinite(j.cell.error) else j.cell._replace(error=0.0) for j in mine)
+            found.append(LinkMeans(mine[0].cell.link, row, tuple(cells), _complete([j.runs for j in mine])))
+    return found
+
+
+def _complete(runs: Sequence[np.ndarray | None]) -> np.ndarray | None:
+    """Runs that have a value in every cell, (runs, cells); None of means, or if too few have."""
+    there = [values for values in runs if values is not None]
+    if len(there) < len(runs):
+        return None
+    table = np.stack(there, axis=1)
+    complete = ~np.isnan(table).any(axis=1)
+    return table[complete] if complete.mean() >= COMPLETE and complete.sum() > 1 else None
 
 
 def summary(causes: Sequence[Cause]) -> str:
@@ -325,9 +351,7 @@ class _Diagnosis:
         fit = self.results.judge(Means([m for _, m in found], nothing, nothing), len(self.results.blocks))
         shown = ", ".join(f"{µ:.4g}" for µ, _ in found)
         whose = ", ".join(block.link or "given" for block in self.results.blocks)
-        mistake = Mistake(
-            WRONG_LINK, f"the links' probabilities are {{0}} where they should be {whose}", lambda _: iter(())
-        )
+        mistake = Mistake(WRONG_LINK, f"the links' probabilities are {{0}} where they should be {whose}")
         rows = uniform_rows([µ for µ, _ in found])
         means = trial.means(replace(self.base, rows=rows))
         apart = 0.0 if means is None else self.results.apart(means)
@@ -361,15 +385,13 @@ class _Diagnosis:
         )
         text = "the runs are not independent of each other, and tell no more than about {0} that are"
         shown = f"{min(effective):.3g}"
-        return _ClosestMistake(
-            (Mistake(DEPENDENT, text, lambda _: iter(())),), None, fit, min(effective), 1, 0.0, False, shown
-        )
+        return _ClosestMistake((Mistake(DEPENDENT, text),), None, fit, min(effective), 1, 0.0, False, shown)
 
     def _approximate(self, trial: _SimulatorTrials) -> _ClosestMistake | None:
         if self.prediction.nature not in ("approximate", "bound"):
             return None
         text = "nothing is wrong with the simulator: the prediction is approximate, and exact numbers are as the file's"
-        return trial.best((Mistake(APPROXIMATE, text, lambda _: iter(())),), [Variant(lambda _: self.base)])
+        return trial.best((Mistake(APPROXIMATE, text),), [Variant(lambda _: self.base)])
 
 
 class _SimulatorTrials:
@@ -508,23 +530,24 @@ def _curve(
     if prediction.scenario.network.agents < 2:
         return None
 
-    def one(cell: CellMean, µ: np.ndarray) -> np.ndarray:
+    def one(cell: Cell, µ: np.ndarray) -> np.ndarray:
         groups = sorted({int(prediction.group_of[a - 1]) for a in cell.agents})
         share = [sum(int(prediction.group_of[a - 1]) == g for a in cell.agents) for g in groups]
-        states = list(cell.metric.states)
+        if cell.quantity not in (CLAIMED, ERROR, SQUARED):
+            return np.full(len(µ), cell.expected)
+        sense = metric_of(cell.metric, prediction.scenario.model)
+        states = list(sense.states)
         if cell.quantity == SQUARED:
             M = outcomes.covariance(µ, "rms")[:, cell.step - 1, groups]
             return np.average(np.trace(M[..., states, :][..., states], axis1=-2, axis2=-1), axis=1, weights=share)
         if cell.quantity == ERROR:
             b = outcomes.covariance(µ, "bias")[:, cell.step - 1, groups, states[0], 0]
             return np.average(b, axis=1, weights=share)
-        if cell.quantity != CLAIMED:
-            return np.full(len(µ), cell.expected)
-        if cell.metric.linear:
+        if sense.linear:
             M = outcomes.covariance(µ)[:, cell.step - 1]
-            return np.average(np.stack([cell.metric.of(M[:, g]) for g in groups]), axis=0, weights=share)
+            return np.average(np.stack([sense.of(M[:, g]) for g in groups]), axis=0, weights=share)
         moved = replace(outcomes, links=uniform_rows(µ))
-        spread = [moved.distribution(cell.metric, cell.step, [g]) for g in groups]
+        spread = [moved.distribution(sense, cell.step, [g]) for g in groups]
         return np.average([Distribution.mean(s) for s in spread], axis=0, weights=share)
 
     return lambda µ: [np.stack([one(cell, µ) for cell in block.cells], axis=1) for block in blocks]

@@ -49,9 +49,10 @@ class Cell(NamedTuple):
     z, p : z-score, and p-value corrected for the number of cells.
     agrees : whether p is above its share of α.
     quantity : "claimed", "bias", "actual" (mean squared error) or "nees".
-    metric : in which sense; "nees" of the NEES.
+    metric : in which sense, of a bias that of its state; "nees" of the NEES.
     column : of the file.
     expected_error : standard error of what is expected, 0 where it is not sampled.
+    resolution : what the digits of the file leave open of the mean.
     """
 
     link: str
@@ -62,13 +63,14 @@ class Cell(NamedTuple):
     mean: float
     error: float
     expected: float
-    z: float
-    p: float
-    agrees: bool
+    z: float = 0.0
+    p: float = 1.0
+    agrees: bool = True
     quantity: str = "claimed"
     metric: str = "trace"
     column: str = "covariance"
     expected_error: float = 0.0
+    resolution: float = 0.0
 
 
 class Judged(NamedTuple):
@@ -211,8 +213,8 @@ def of_runs(
                     continue
                 share = _share(float(values.std(ddof=1)), float(link.single[i][group, step]), len(values),
                                int(link.number[i][group, step]))  # fmt: skip
-                cell = _cell(results.links[row], row, step + 1, whose, family)
-                cell = cell._replace(runs=len(values), mean=float(values.mean()), error=float(values.std(ddof=1)))
+                cell = Cell(results.links[row], row, step + 1, whose, len(values), float(values.mean()),
+                            float(values.std(ddof=1)), 0.0)  # fmt: skip
                 judged.append(_judged(cell, family, expected[i], share)._replace(runs=runs))
                 if judged[-1].skewness is None:
                     judged[-1] = judged[-1]._replace(skewness=_skewness(values))
@@ -248,14 +250,10 @@ def of_means(
                             f"{results.at(place, name)}: expected a number, since method {prediction.method} does not "
                             "know the spread over the outcomes"
                         )
-                    cell = _cell(results.links[row], row, step, whose, family)
-                    cell = cell._replace(runs=int(counts[place]), mean=float(family.values[place]), error=std)
+                    mean = float(family.values[place])
+                    cell = Cell(results.links[row], row, step, whose, int(counts[place]), mean, std, 0.0)
                     judged.append(_judged(cell, family, each, 1.0))
     return judged
-
-
-def _cell(link: str, row: int, step: int, agents: tuple[int, ...], family: Family) -> Cell:
-    return Cell(link, row, step, agents, 0, 0, 0, 0, 0, 0, True, family.quantity, family.metric, family.column)
 
 
 def _share(averaged: float, single: float, runs: int, values: int) -> float:
@@ -292,6 +290,16 @@ def _judged(cell: Cell, family: Family, expected: ColumnExpectation, share: floa
         shift = max(0.0, abs(beyond) - 2.0 * other)
         if expected.law is not None:
             p = max(p, expected.law(row).tail(wanted + float(np.copysign(shift, beyond)), runs))
-    done = cell._replace(expected=wanted, error=own, z=z, p=p, expected_error=other)
+    done = cell._replace(
+        error=own,
+        expected=wanted,
+        z=z,
+        p=p,
+        quantity=family.quantity,
+        metric=family.metric,
+        column=family.column,
+        expected_error=other,
+        resolution=family.resolution,
+    )
     drawn = None if expected.drawn is None else expected.drawn[row]
     return Judged(done, skewness if known else None, None, drawn, given)

@@ -10,8 +10,7 @@ The reader says what it wants as `ColumnField`s, and gets NumPy columns that nee
 Everything else is refused with its place: "results.csv, line 7, column 'step': expected …, got …".  Lines of CSV and
 records of JSON and Parquet count from 1; rows of arrays and data frames from 0, as `iloc` does.
 
-Long files are read part by part, so that `read_chunks` needs no more memory for them than for short ones; how, and what
-separates cells and lines, is said in `stochfuse.data.tables`.
+Files are read part by part; how, and what separates cells and lines, is said in `stochfuse.data.tables`.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.data.tables import (
-    BATCH,
     LABEL,
     NUMBER,
     TEXT,
@@ -124,6 +122,11 @@ class Columns:
         where = f"{self.source}, {self.what} {self.line(row)}"
         return f"{where}, column '{column}'" if column else where
 
+    def said(self, row: int, column: str) -> str:
+        """Return what a cell of a column of texts says, in quotation marks."""
+        codes, names = self.text[column]
+        return f"'{names[codes[row]]}'"
+
     def error(self, row: int, column: str, expected: str, got: object) -> ColumnsError:
         """Return the error of a cell that a reader cannot use."""
         return ColumnsError(f"{self.at(row, column)}: expected {expected}, got {got}")
@@ -134,22 +137,6 @@ class Columns:
         if not texts or any("e" in text for text in texts):
             return 0.0
         return 0.5 * 10.0 ** -max(len(text.partition(".")[2]) for text in texts)
-
-    def part(self, start: int, stop: int) -> Columns:
-        """Return some rows that follow each other."""
-        stop = min(stop, self.length)
-        first = int(np.searchsorted(self.starts, start, side="right")) - 1
-        last = int(np.searchsorted(self.starts, stop, side="left"))
-        starts = np.maximum(self.starts[first:last], start)
-        return replace(
-            self,
-            length=stop - start,
-            number={name: values[start:stop] for name, values in self.number.items()},
-            text={name: Labels(codes[start:stop], names) for name, (codes, names) in self.text.items()},
-            blank={name: mask[start:stop] for name, mask in self.blank.items()},
-            starts=starts - start,
-            firsts=self.firsts[first:last] + starts - self.starts[first:last],
-        )
 
 
 def read_columns(
@@ -192,32 +179,11 @@ def read_columns(
     >>> found.number["step"], found.number["z1"]
     (array([1, 2]), array([0.5, nan]))
     """
-    return _joined(list(_parts(source, fields, renamed or {}, others, empty)))
-
-
-def read_chunks(
-    source: Any,
-    fields: Fields,
-    renamed: Mapping[str, str] | None = None,
-    *,
-    others: bool = True,
-    rows: int = BATCH,
-) -> Iterator[Columns]:
-    """Read a table in chunks of at most some rows, as `read_columns` does; memory is bounded but for JSON.
-
-    Codes of texts keep their meaning from chunk to chunk.
-    """
-    for part in _parts(source, fields, renamed or {}, others):
-        for start in range(0, part.length, rows):
-            yield part.part(start, start + rows)
-
-
-def _parts(source: Any, fields: Fields, renamed: Renamed, others: bool, empty: bool = False) -> Iterator[Columns]:
     with ExitStack() as stack:
-        yield from _parts_of(opened(source, stack), fields, renamed, others, empty)
+        return _joined(list(_parts(opened(source, stack), fields, renamed or {}, others, empty)))
 
 
-def _parts_of(table: OpenedTable, fields: Fields, renamed: Renamed, others: bool, empty: bool) -> Iterator[Columns]:
+def _parts(table: OpenedTable, fields: Fields, renamed: Renamed, others: bool, empty: bool) -> Iterator[Columns]:
     places, wanted, skipped = _matched(table, fields, renamed, others)
     known: dict[str, dict[str, int]] = {field.name: {} for field in wanted}
     kinds = {place: field.kind for place, field in zip(places, wanted, strict=True)}
@@ -246,7 +212,7 @@ def _parts_of(table: OpenedTable, fields: Fields, renamed: Renamed, others: bool
 
 def _nothing(table: OpenedTable, wanted: Sequence[ColumnField], skipped: tuple[str, ...]) -> Columns:
     """No rows, but with headings."""
-    number = {field.name: np.zeros(0) for field in wanted if field.kind != TEXT}
+    number = {f.name: np.zeros(0, float if f.kind == NUMBER else np.int64) for f in wanted if f.kind != TEXT}
     text = {field.name: Labels(np.zeros(0, dtype=np.int32), ()) for field in wanted if field.kind == TEXT}
     none = np.zeros(0, dtype=np.int64)
     return Columns(table.name, 0, number, text, {}, {}, skipped, table.what, none, none)

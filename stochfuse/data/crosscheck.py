@@ -161,9 +161,9 @@ def crosscheck(
             f"method {prediction.method} knows averages only: the {what} expected is sampled, {again.meta['runs']} "
             f"runs of estimator {whose}"
         )
-    verdict = check_results(read, prediction, chosen, alpha, again)
+    verdict, judged = _judged(read, prediction, chosen, alpha, again)
     verdict = replace(verdict, notes=(*said, *verdict.notes))
-    return replace(verdict, causes=causes_of(verdict, rows)) if causes else verdict
+    return replace(verdict, causes=causes_of(verdict, judged, rows)) if causes else verdict
 
 
 def _predicted(
@@ -252,6 +252,13 @@ def check_results(
     UsageError
         If the results do not fit the prediction.
     """
+    return _judged(results, prediction, metric, alpha, sampled)[0]
+
+
+def _judged(
+    results: SimulatorResults, prediction: Prediction, metric: Metric, alpha: float, sampled: Prediction | None
+) -> tuple[Verdict, list[Judged]]:
+    """The verdict, without causes, and its cells with the runs behind them."""
     if not 0 < alpha < 1:
         raise UsageError(f"alpha: expected a probability between 0 and 1, got {alpha:g}")
     who = _agents(results, prediction)
@@ -276,7 +283,7 @@ def check_results(
     level = alpha / 2 if all_cells is not None else alpha
     cells = [j.cell._replace(p=min(1.0, j.cell.p * len(raw)), agrees=j.cell.p * len(raw) > level) for j in raw]
     largest = min((cell.p for cell in cells), default=1.0)
-    return Verdict(
+    verdict = Verdict(
         agrees=largest > level and (all_cells is None or all_cells > level) and not results.evidence,
         alpha=alpha,
         cells=cells,
@@ -290,6 +297,7 @@ def check_results(
         evidence=results.evidence,
         notes=tuple(notes),
     )
+    return verdict, raw
 
 
 def _agents(results: SimulatorResults, prediction: Prediction) -> np.ndarray | None:

@@ -15,12 +15,13 @@ Every run has streams of random numbers of its own, so that it depends on the se
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from stochfuse.data.records import arrivals_of
+from stochfuse.data.records import NUMBERS, RecordedRuns, arrivals_of
 from stochfuse.engines.events import events
 from stochfuse.engines.monte_carlo import draw_fates
 from stochfuse.engines.replay import ArrivalRecord
@@ -30,10 +31,13 @@ from stochfuse.estimators.readings import Function, Readings
 from stochfuse.estimators.world import World
 from stochfuse.kalman.kernel import at_step, factor
 from stochfuse.scenario.network import LinkRows
+from stochfuse.scenario.scenario import Scenario
 from stochfuse.scenario.system import System
 
 ARRIVALS, NOISES, DETECTIONS = 0, 1, 2
 """What a stream of random numbers is for."""
+DEPARTS = 1e-6
+"""Largest part of its size by which a nominal path may depart from the model without a word."""
 
 
 class Drawn(NamedTuple):
@@ -119,6 +123,71 @@ def drawn(
         if functions[agent] is not None:  # its matrices are made where it measures, whatever the nominal path says
             missed[:, 1:, agent] = np.isnan(each[:, 1:, 0])
     return Drawn(truth, tuple(z), relations, missed, tuple(begun))
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """Records that are drawn, in the form of those that are read (`stochfuse.data.records.Records`).
+
+    Parameters
+    ----------
+    scenario : what is simulated.
+    names : of the runs.
+    links : one row of link probabilities.
+    seed : of everything.
+    write : what is told every batch, its runs' names, and by agent which measurements are there.
+    """
+
+    scenario: Scenario
+    names: tuple[str, ...]
+    links: LinkRows
+    seed: int
+    write: Callable[[RecordedRuns, Sequence[str], Callable[[int], np.ndarray]], None] | None = None
+
+    given, with_truth = True, True
+    """Whether arrivals come with the records, and whether the truth does."""
+
+    @property
+    def known(self) -> np.ndarray:
+        """States of which the truth is known: all."""
+        return np.arange(self.scenario.model.dimension)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What should be known of the draws."""
+        nominal, model = self.scenario.nominal, self.scenario.system.model
+        if nominal is None or len(model.F) < 2:
+            return ()
+        nominal = nominal[: len(model.F)]
+        moved = (model.F[1:] @ nominal[:-1, :, None] + model.Bu[1:])[..., 0]
+        off = float(np.abs(moved - nominal[1:]).max())
+        if off <= DEPARTS * float(np.abs(nominal).max()):
+            return ()
+        return (f"the truth follows the model; the nominal path departs from it by up to {off:.3g} in a step",)
+
+    def batches(self) -> Iterator[RecordedRuns]:
+        """Draw some runs at a time."""
+        system, runs = self.scenario.system, len(self.names)
+        size = max(1, NUMBERS // (system.agents * system.steps))
+        nominal = self.scenario.nominal
+        start = system.x0 if nominal is None else nominal[0][:, None]
+        for first in range(0, runs, size):
+            count = min(size, runs - first)
+            found = drawn(system, self.scenario.instruments, start, count, self.seed, first)
+            arrivals = drawn_arrivals(system, self.links, found.missed, self.seed, first)
+            batch = RecordedRuns(
+                np.arange(first, first + count),
+                tuple(np.nan_to_num(z) for z in found.z),
+                found.relations,
+                arrivals,
+                found.missed,
+                found.truth,
+                found.first,
+            )
+            if self.write is not None:
+                seen = [~np.isnan(z[..., 0]) for z in found.z]
+                self.write(batch, self.names[first : first + count], seen.__getitem__)
+            yield batch
 
 
 def _misses(system: System, runs: int, seed: int, first: int) -> np.ndarray:

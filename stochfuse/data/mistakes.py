@@ -17,17 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.data.supposed import (
-    ALONE,
-    AS_IT_WAS,
-    BOTH_WAYS,
-    LOCAL,
-    OWN_LOST,
-    PRIOR,
-    CellMean,
-    Shown,
-    Simulator,
-)
+from stochfuse.data.cells import Cell
+from stochfuse.data.supposed import ALONE, AS_IT_WAS, BOTH_WAYS, LOCAL, OWN_LOST, PRIOR, Shown, Simulator
 from stochfuse.kalman.metrics import metric
 from stochfuse.scenario.network import ARCHITECTURES, LinkRows, mean_delivery
 from stochfuse.scenario.registry import LFG, NAIVE, OPTIMAL, STAND_ALONE, SUMS
@@ -70,36 +61,40 @@ class Mistake(NamedTuple):
     ----------
     name : as programs read it.
     text : what it is, in a line; {0} is the estimated number.
-    variants : ways to make it in a simulator.
+    variants : ways to make it in a simulator; none of what is found otherwise.
     """
 
     name: str
     text: str
-    variants: Callable[[Simulator], Iterator[Variant]]
+    variants: Callable[[Simulator], Iterator[Variant]] = lambda _: iter(())
 
 
 def _certain(simulator: Simulator, note: str = "") -> Variant:
     return Variant(lambda _: simulator, note=note)
 
 
-def _numbers(s: Simulator, make: Callable[[System, float], System]) -> Iterator[Variant]:
-    """Of a changed system, with an unknown factor: in the whole simulator, or where the filters alone have it."""
+def _system(s: Simulator, **changes: Any) -> Simulator:
+    return replace(s, system=replace(s.system, **changes))
 
-    def whole(log: float) -> Simulator:
-        return replace(s, system=make(s.system, float(np.exp(log))))
 
-    def believed(log: float) -> Simulator:
-        return replace(s, told=make(s.told or s.system, float(np.exp(log))))
+def _network(s: Simulator, **changes: Any) -> Simulator:
+    return _system(s, network=replace(s.system.network, **changes))
 
-    yield Variant(whole, SCALES, np.exp)
+
+def _rows(s: Simulator, **changes: Any) -> Simulator:
+    return replace(s, rows=replace(s.rows, **changes))
+
+
+def _systems(s: Simulator) -> Iterator[tuple[str, System, str]]:
+    """What a number may be wrong in, and which that is: the whole simulator, or what its filters alone are told."""
+    yield "system", s.system, ""
     if s.followed and s.estimator in SUMS:
-        yield Variant(believed, SCALES, np.exp, FILTERS)
+        yield "told", s.told or s.system, FILTERS
 
 
 def _changed(s: Simulator, make: Callable[[System], System]) -> Iterator[Variant]:
-    yield _certain(replace(s, system=make(s.system)))
-    if s.followed and s.estimator in SUMS:
-        yield _certain(replace(s, told=make(s.told or s.system)), FILTERS)
+    for where, system, note in _systems(s):
+        yield _certain(replace(s, **{where: make(system)}), note)
 
 
 def scaled(system: System, *, Q: float = 1.0, R: float = 1.0, P0: float = 1.0) -> System:
@@ -119,7 +114,12 @@ def scaled(system: System, *, Q: float = 1.0, R: float = 1.0, P0: float = 1.0) -
 
 
 def _scaled(s: Simulator, which: str) -> Iterator[Variant]:
-    return _numbers(s, lambda system, factor: scaled(system, **{which: factor}))
+    for where, system, note in _systems(s):
+
+        def of(log: float, where: str = where, system: System = system) -> Simulator:
+            return replace(s, **{where: scaled(system, **{which: float(np.exp(log))})})
+
+        yield Variant(of, SCALES, np.exp, note)
 
 
 def _concerned(s: Simulator) -> tuple[bool, ...]:
@@ -213,7 +213,7 @@ def _measured_first(s: Simulator) -> Iterator[Variant]:
 
 def _start(s: Simulator, shared: bool) -> Iterator[Variant]:
     if s.system.shared != shared and s.system.agents > 1:
-        yield _certain(replace(s, system=replace(s.system, shared=shared)))
+        yield _certain(_system(s, shared=shared))
 
 
 def _estimator(s: Simulator, name: str, unless: tuple[str, ...] = ()) -> Iterator[Variant]:
@@ -236,10 +236,6 @@ def _habit(s: Simulator, habit: str) -> Iterator[Variant]:
     }
     if fits[habit]:
         yield _certain(replace(s, habits=s.habits | {habit}))
-
-
-def _network(s: Simulator, **changes: Any) -> Simulator:
-    return replace(s, system=replace(s.system, network=replace(s.system.network, **changes)))
 
 
 def _delayed(s: Simulator) -> Iterator[Variant]:
@@ -279,21 +275,18 @@ def _agents(s: Simulator) -> Iterator[Variant]:
 def _links(s: Simulator, of: Callable[[np.ndarray], np.ndarray]) -> Iterator[Variant]:
     if s.system.agents > 1 and s.rows.bursts is None:
         there = s.rows.link > 0 if s.rows.link.ndim > 2 else np.ones(1, dtype=bool)
-        yield _certain(replace(s, rows=replace(s.rows, link=np.where(there, of(s.rows.link), s.rows.link))))
+        yield _certain(_rows(s, link=np.where(there, of(s.rows.link), s.rows.link)))
 
 
 def _turned(s: Simulator) -> Iterator[Variant]:
     if not s.rows.uniform:
-        yield _certain(replace(s, rows=replace(s.rows, link=np.swapaxes(s.rows.link, -1, -2))))
+        yield _certain(_rows(s, link=np.swapaxes(s.rows.link, -1, -2)))
 
 
 def _scaled_links(s: Simulator) -> Iterator[Variant]:
     if not s.rows.uniform and s.rows.bursts is None:
-
-        def of(log: float) -> Simulator:
-            return replace(s, rows=replace(s.rows, link=np.minimum(1.0, s.rows.link * np.exp(log))))
-
-        yield Variant(of, tuple(np.log([0.25, 0.5, 0.8, 1.25, 2.0])), np.exp)
+        grid = tuple(np.log([0.25, 0.5, 0.8, 1.25, 2.0]))
+        yield Variant(lambda log: _rows(s, link=np.minimum(1.0, s.rows.link * np.exp(log))), grid, np.exp)
 
 
 def _silent_at_first(s: Simulator) -> Iterator[Variant]:
@@ -302,7 +295,7 @@ def _silent_at_first(s: Simulator) -> Iterator[Variant]:
     rows, steps = s.rows, s.system.steps
     every = rows.link.copy() if rows.varies else np.repeat(rows.link[:, None], steps, axis=1)
     every[:, 0] = 0.0
-    yield _certain(replace(s, rows=replace(rows, link=every)))
+    yield _certain(_rows(s, link=every))
 
 
 def with_memory(rows: LinkRows, memory: float) -> LinkRows:
@@ -354,59 +347,46 @@ def _no_bursts(s: Simulator) -> Iterator[Variant]:
     if s.rows.bursts is not None:
         pairs = zip(s.rows.link, s.rows.bursts, strict=True)
         link = np.array([µ if b is None else np.where(µ > 0, mean_delivery(b), 0.0) for µ, b in pairs])
-        yield _certain(replace(s, rows=replace(s.rows, link=link, bursts=None)))
+        yield _certain(_rows(s, link=link, bursts=None))
 
 
-def _shown(s: Simulator, *some: Shown) -> Iterator[Variant]:
+def _shown(s: Simulator, *some: Shown, note: str = "") -> Iterator[Variant]:
     for one in some:
-        yield _certain(replace(s, shown=(*s.shown, one)))
+        yield _certain(replace(s, shown=(*s.shown, one)), note)
 
 
-def _times(
-    numbers: np.ndarray, cell: CellMean, s: Simulator, *, of: Callable[[CellMean, Simulator], float]
-) -> np.ndarray:
-    return numbers * of(cell, s)
+def _times(s: Simulator, *factors: Callable[[Cell, Simulator], float], note: str = "") -> Iterator[Variant]:
+    """Numbers are shown times a factor."""
+    for factor in factors:
+        yield from _shown(s, lambda numbers, cell, s, factor=factor: numbers * factor(cell, s), note=note)
 
 
-def _root(numbers: np.ndarray, cell: CellMean, s: Simulator) -> np.ndarray:
-    return np.sqrt(np.maximum(numbers, 0.0))
+def _power(cell: Cell, s: Simulator) -> int:
+    """Which power of the states' units a cell's numbers are in."""
+    return 2 if metric(cell.metric, s.system.model).squared else 1
 
 
-def _square(numbers: np.ndarray, cell: CellMean, s: Simulator) -> np.ndarray:
-    return numbers**2
+def _three(numbers: np.ndarray, cell: Cell, s: Simulator) -> np.ndarray:
+    return 3.0 * (np.sqrt(numbers) if _power(cell, s) == 2 else numbers)
 
 
-def _inverse(numbers: np.ndarray, cell: CellMean, s: Simulator) -> np.ndarray:
-    return 1.0 / numbers
-
-
-def _three(numbers: np.ndarray, cell: CellMean, s: Simulator) -> np.ndarray:
-    return 3.0 * (np.sqrt(numbers) if cell.metric.squared else numbers)
-
-
-def _constant(numbers: np.ndarray, cell: CellMean, s: Simulator, *, which: str) -> np.ndarray:
+def _constant(numbers: np.ndarray, cell: Cell, s: Simulator, *, which: str) -> np.ndarray:
     k = min(cell.step, s.system.steps) - 1
     M = s.system.model.Q[k] if which == "Q" else s.system.sensors[s.system.sensor_of[cell.agents[0] - 1]].R[k]
-    value = cell.metric.of(M) if len(M) == s.system.dimension else np.trace(M)
+    value = metric(cell.metric, s.system.model).of(M) if len(M) == s.system.dimension else np.trace(M)
     return np.full_like(numbers, float(value))
 
 
 def _noise(s: Simulator) -> Iterator[Variant]:
     for which in ("R", "Q"):
-        yield from (v._replace(note=which) for v in _shown(s, partial(_constant, which=which)))
-
-
-def _deviation(s: Simulator) -> Iterator[Variant]:
-    return _shown(s, _root)
+        yield from _shown(s, partial(_constant, which=which), note=which)
 
 
 def _sum(s: Simulator) -> Iterator[Variant]:
-    n, d = s.system.agents, s.system.dimension
-    for number, name in ((n, "agents"), (d, "states")):
+    for number, name in ((s.system.agents, "agents"), (s.system.dimension, "states")):
         if number > 1:
-            for factor, note in ((float(number), f"the sum over {name}"), (1.0 / number, f"the mean over {name}")):
-                found = _shown(s, partial(_times, of=lambda c, s, factor=factor: factor))
-                yield from (v._replace(note=note) for v in found)
+            yield from _times(s, lambda *_, number=number: float(number), note=f"the sum over {name}")
+            yield from _times(s, lambda *_, number=number: 1.0 / number, note=f"the mean over {name}")
 
 
 def _one_agent(s: Simulator) -> Iterator[Variant]:
@@ -443,41 +423,19 @@ def _no_noise(s: Simulator) -> Iterator[Variant]:
         yield from _changed(s, lambda system: scaled(system, Q=0.0))
 
 
-def _no_error(s: Simulator) -> Iterator[Variant]:
+def _other_error(s: Simulator, of: Callable[[np.ndarray], np.ndarray | None]) -> Iterator[Variant]:
     if s.followed and s.system.error is not None and s.system.error.any():
-        yield _certain(replace(s, system=replace(s.system, error=None)))
-
-
-def _other_sign(s: Simulator) -> Iterator[Variant]:
-    if s.followed and s.system.error is not None and s.system.error.any():
-        yield _certain(replace(s, system=replace(s.system, error=-s.system.error)))
+        yield _certain(_system(s, error=of(s.system.error)))
 
 
 def _with_error(s: Simulator) -> Iterator[Variant]:
     if s.followed and s.system.dimension == 1 and s.system.one_state:
         deviation = np.sqrt(s.system.P0)
         yield Variant(
-            lambda at: replace(s, system=replace(s.system, error=at * deviation)),
+            lambda at: _system(s, error=at * deviation),
             (-10.0, -3.0, -1.0, -0.3, 0.3, 1.0, 3.0, 10.0),
             lambda at: at * float(deviation[0, 0]),
         )
-
-
-def _per_root(s: Simulator) -> Iterator[Variant]:
-    yield from _shown(
-        s,
-        partial(_times, of=lambda c, s: c.runs**-0.5),
-        partial(_times, of=lambda c, s: s.system.agents**-0.5),
-        partial(_times, of=lambda c, s: 1.0 / c.runs),
-    )
-
-
-def _degrees(s: Simulator) -> Iterator[Variant]:
-    yield from _shown(
-        s,
-        partial(_times, of=lambda c, s: (180.0 / np.pi) ** (2 if c.metric.squared else 1)),
-        partial(_times, of=lambda c, s: (np.pi / 180.0) ** (2 if c.metric.squared else 1)),
-    )
 
 
 WRONG_LINK, DEPENDENT = "wrong-link", "dependent-runs"
@@ -537,11 +495,15 @@ MISTAKES = (
         lambda s: _links(s, np.square),
     ),
     Mistake("links-ignored", "every message arrives", lambda s: _links(s, np.ones_like)),
-    Mistake("deviation-for-variance", "the root is shown: a standard deviation for a variance", _deviation),
+    Mistake(
+        "deviation-for-variance",
+        "the root is shown: a standard deviation for a variance",
+        lambda s: _shown(s, lambda numbers, *_: np.sqrt(np.maximum(numbers, 0.0))),
+    ),
     Mistake(
         "variance-for-deviation",
         "the square is shown: a variance for a standard deviation",
-        lambda s: _shown(s, _square),
+        lambda s: _shown(s, lambda numbers, *_: numbers**2),
     ),
     Mistake("three-sigma", "three standard deviations are shown", lambda s: _shown(s, _three)),
     Mistake("sum-for-mean", "a sum over agents or states is shown for a mean, or a mean for a sum", _sum),
@@ -572,8 +534,16 @@ MISTAKES = (
         "the covariance of the first estimates is {0:.3g} times that of the scenario",
         lambda s: _scaled(s, "P0"),
     ),
-    Mistake("initial-error-left-out", "the known initial error (initial.error) is left out", _no_error),
-    Mistake("sign-of-error", "errors have the other sign: truth less estimate", _other_sign),
+    Mistake(
+        "initial-error-left-out",
+        "the known initial error (initial.error) is left out",
+        lambda s: _other_error(s, lambda error: None),
+    ),
+    Mistake(
+        "sign-of-error",
+        "errors have the other sign: truth less estimate",
+        lambda s: _other_error(s, np.negative),
+    ),
     Mistake("initial-error", "the first estimates are off by {0:.3g} on average", _with_error),
     Mistake("F-transposed", "F is transposed", _transposed),
     Mistake("wrong-number-of-agents", "there is an agent more, or one less", _agents),
@@ -583,9 +553,21 @@ MISTAKES = (
     Mistake("no-bursts", "losses are independent, where the scenario has bursts", _no_bursts),
     Mistake("links-drawn-once", "each link is drawn once for all steps of a run", _drawn_once),
     Mistake("bursts", "losses come in bursts, with correlation {0:.2g} from step to step", _bursts),
-    Mistake("inverse-shown", "the information, 1/P, is shown", lambda s: _shown(s, _inverse)),
-    Mistake("divided-by-runs", "a standard error, or a number divided by that of runs, is shown", _per_root),
-    Mistake("degrees", "radians and degrees are confused", _degrees),
+    Mistake(
+        "inverse-shown",
+        "the information, 1/P, is shown",
+        lambda s: _shown(s, lambda numbers, *_: 1.0 / numbers),
+    ),
+    Mistake(
+        "divided-by-runs",
+        "a standard error, or a number divided by that of runs, is shown",
+        lambda s: _times(s, lambda c, _: c.runs**-0.5, lambda _, s: s.system.agents**-0.5, lambda c, _: 1.0 / c.runs),
+    ),
+    Mistake(
+        "degrees",
+        "radians and degrees are confused",
+        lambda s: _times(s, lambda c, s: (180.0 / np.pi) ** _power(c, s), lambda c, s: (np.pi / 180.0) ** _power(c, s)),
+    ),
     Mistake("best-for-graph", "the optimum of what arrived is shown", lambda s: _estimator(s, OPTIMAL, (STAND_ALONE,))),
     Mistake(
         "intersection-for-graph",

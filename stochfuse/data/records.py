@@ -30,6 +30,7 @@ from stochfuse.estimators.protocol import Late
 from stochfuse.scenario.network import reachable
 from stochfuse.scenario.scenario import Scenario, load_scenario
 
+RUN, STEP = ColumnField("run", TEXT, required=False), ColumnField("step", WHOLE, 1)
 ALONE = ("1",)
 """Names of the runs where no file has any."""
 NUMBERS = 400_000
@@ -437,13 +438,7 @@ class _ScenarioReader:
         def fields(names: Sequence[str]) -> list[ColumnField]:
             z = [ColumnField(f"z{i}", blank=True, free=True, required=i == 1) for i in range(1, most + 1)]
             own = [ColumnField("of", TEXT, required=False, blank=True)] if self.scenario.relations else []
-            return [
-                ColumnField("run", TEXT, required=False),
-                ColumnField("step", WHOLE, 1),
-                ColumnField("agent", TEXT),
-                *own,
-                *z,
-            ]
+            return [RUN, STEP, ColumnField("agent", TEXT), *own, *z]
 
         found = self.columns(source, fields)
         agent = self._agent(found, "agent")
@@ -457,18 +452,14 @@ class _ScenarioReader:
         for row in np.flatnonzero(of >= 0).tolist():
             relation = self.scenario.relations.get((int(agent[row]), int(of[row])))
             if relation is None:
-                raise found.error(
-                    row, "of", "an agent that the scenario lets it measure", f"'{self._said(found, 'of', row)}'"
-                )
+                raise found.error(row, "of", "an agent that the scenario lets it measure", found.said(row, "of"))
             expected[row] = relation.R.shape[-1]
         blind = expected == 0
         if (blind & ~np.isnan(values).all(axis=1)).any():
             row = int((blind & ~np.isnan(values).all(axis=1)).argmax())
-            raise found.error(
-                row, "agent", "an agent with a sensor", f"'{self._said(found, 'agent', row)}' without one"
-            )
+            raise found.error(row, "agent", "an agent with a sensor", f"{found.said(row, 'agent')} without one")
         self._check_width(found, values, expected, z)
-        step = found.number["step"].astype(np.int64) - 1
+        step = found.number["step"] - 1
         early = int((~np.isnan(values[:, 0]) & (step == 0)).sum())
         where = np.stack([step, agent, of], axis=1)
         notes = []
@@ -488,31 +479,21 @@ class _ScenarioReader:
         def fields(names: Sequence[str]) -> list[ColumnField]:
             ends = [ColumnField("receiver", TEXT), ColumnField("sender", TEXT)]
             if "step" not in names and "seq" in names:
-                return [
-                    ColumnField("run", TEXT, required=False),
-                    ColumnField("seq", WHOLE, 0),
-                    *ends,
-                    ColumnField("received", WHOLE, 0, required=False),
-                ]
-            return [
-                ColumnField("run", TEXT, required=False),
-                ColumnField("step", WHOLE, 1),
-                *ends,
-                ColumnField("sent_step", WHOLE, 1, required=False, blank=True),
-            ]
+                return [RUN, ColumnField("seq", WHOLE, 0), *ends, ColumnField("received", WHOLE, 0, required=False)]
+            return [RUN, STEP, *ends, ColumnField("sent_step", WHOLE, 1, required=False, blank=True)]
 
         found = self.columns(source, fields, empty=True)
         receiver, sender = self._agent(found, "receiver"), self._agent(found, "sender")
         notes, there = [], np.ones(len(found), dtype=bool)
         if "seq" in found:
-            seq = found.number["seq"].astype(np.int64)
+            seq = found.number["seq"]
             begins = int(seq.min(initial=1))
             step = seq - begins
             notes.append(f"{found.source}: a packet log; packet {begins} is taken for step 1's")
             there = found.number["received"] != 0 if "received" in found else there
             sent = step
         else:
-            step = found.number["step"].astype(np.int64) - 1
+            step = found.number["step"] - 1
             sent = step
             if "sent_step" in found:
                 told = found.number["sent_step"]
@@ -550,19 +531,14 @@ class _ScenarioReader:
                     f"truth: expected states as columns, some of {', '.join(states)}; got {', '.join(names)}"
                 )
             given = [ColumnField(state, blank=True) for state in shown]
-            return [
-                ColumnField("run", TEXT, required=False),
-                ColumnField("step", WHOLE, 1),
-                ColumnField("agent", TEXT, required=own),
-                *given,
-            ]
+            return [RUN, STEP, ColumnField("agent", TEXT, required=own), *given]
 
         found = self.columns(source, fields)
         self.known = np.array([states.index(state) for state in shown])
         agent = self._agent(found, "agent") if "agent" in found else np.full(len(found), -1)
         values = np.stack([found.number[state] for state in shown], axis=1)
         self._check_size(found, values, shown, "a number or nothing")
-        step = found.number["step"].astype(np.int64) - 1
+        step = found.number["step"] - 1
         notes = []
         if len(shown) < len(states):
             lost = ", ".join(state for state in states if state not in shown)
@@ -572,7 +548,7 @@ class _ScenarioReader:
     def first(self, source: Any) -> _RawTable:
         """First estimates: keys 0, agent."""
         states = self.scenario.model.states
-        given = [ColumnField("run", TEXT, required=False), ColumnField("agent", TEXT), *map(ColumnField, states)]
+        given = [RUN, ColumnField("agent", TEXT), *map(ColumnField, states)]
         found = self.columns(source, lambda _: given)
         agent = self._agent(found, "agent")
         values = np.stack([found.number[state] for state in states], axis=1)
@@ -592,10 +568,6 @@ class _ScenarioReader:
     def _width(self, agent: int) -> int:
         return self.scenario.sensors[self.scenario.sensor_of[agent]].H.shape[-2]
 
-    def _said(self, found: Columns, column: str, row: int) -> str:
-        codes, names = found.text[column]
-        return names[codes[row]]
-
     def _agent(self, found: Columns, column: str, blank: bool = False) -> np.ndarray:
         """Agents by number from 0; −1 where a cell is empty."""
         codes, names = found.text[column]
@@ -606,8 +578,8 @@ class _ScenarioReader:
             row, n = int(wrong.argmax()), self.scenario.network.agents
             known = self.scenario.network.names
             listed = f", or {', '.join(known[:6])}{', …' if len(known) > 6 else ''}" if known else ""
-            said = self._said(found, column, row)
-            raise found.error(row, column, f"an agent from 1 to {n}{listed}", f"'{said}'{nearest(said, known)}")
+            said = found.said(row, column)
+            raise found.error(row, column, f"an agent from 1 to {n}{listed}", said + nearest(said[1:-1], known))
         return out
 
     def _check_size(self, found: Columns, values: np.ndarray, names: Sequence[str], expected: str) -> None:
@@ -634,9 +606,7 @@ class _ScenarioReader:
     ) -> None:
         if (receiver == sender).any():
             row = int((receiver == sender).argmax())
-            raise found.error(
-                row, "receiver", "another agent than the sender", f"'{self._said(found, 'receiver', row)}'"
-            )
+            raise found.error(row, "receiver", "another agent than the sender", found.said(row, "receiver"))
         if (sent > step).any():
             row = int((sent > step).argmax())
             raise found.error(row, "sent_step", f"a step up to {step[row] + 1}", sent[row] + 1)
@@ -647,11 +617,14 @@ class _ScenarioReader:
         codes, names = found.text["run"]
         return Labels(codes[kept], names)
 
+    def _by_run(self, found: Columns, keys: np.ndarray) -> np.ndarray:
+        """Keys with the number of the run before them."""
+        runs = found.text["run"].codes[:, None] if "run" in found else np.zeros((len(found), 1), dtype=np.int64)
+        return np.concatenate([runs, keys], axis=1)
+
     def _again(self, found: Columns, keys: np.ndarray, order: np.ndarray) -> np.ndarray:
         """Rows that have the keys of one before them, in some order of rows."""
-        runs = found.text["run"].codes[:, None] if "run" in found else np.zeros((len(found), 1), dtype=np.int64)
-        table = np.concatenate([runs, keys], axis=1)[order]
-        first = np.unique(table, axis=0, return_index=True)[1]
+        first = np.unique(self._by_run(found, keys)[order], axis=0, return_index=True)[1]
         again = np.ones(len(found), dtype=bool)
         again[order[first]] = False
         return again
@@ -662,8 +635,7 @@ class _ScenarioReader:
         """Rows that are there, each once; two that say different things of the same are an error."""
         again = self._again(found, where, np.arange(len(found)))
         if again.any():
-            runs = found.text["run"].codes[:, None] if "run" in found else np.zeros((len(found), 1), dtype=np.int64)
-            _, of = np.unique(np.concatenate([runs, where], axis=1), axis=0, return_inverse=True)
+            _, of = np.unique(self._by_run(found, where), axis=0, return_inverse=True)
             firsts = np.zeros(of.max() + 1, dtype=np.int64)
             firsts[of[~again]] = np.flatnonzero(~again)
             other = firsts[of.ravel()]

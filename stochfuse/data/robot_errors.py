@@ -34,8 +34,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stochfuse.data.robots import RobotRecord, seen, wrapped
+from stochfuse.data.robots import RobotRecord, seen
 from stochfuse.errors import UsageError
+from stochfuse.scenario.sensing import wrapped
 
 GROSS = 5.0
 BLOCK = 1.0
@@ -102,12 +103,8 @@ class ChannelNoises(NamedTuple):
 
     def white(self) -> ChannelNoises:
         """Return them as white noise takes them: at face value."""
-        return self._replace(
-            speed=self.speed.as_white(),
-            turn=self.turn.as_white(),
-            range=self.range.as_white(),
-            bearing=self.bearing.as_white(),
-        )
+        channels = (channel.as_white() for channel in (self.speed, self.turn, self.range, self.bearing))
+        return ChannelNoises(*channels, turning_loss=self.turning_loss, gross=self.gross)
 
 
 class _ChannelErrors(NamedTuple):

@@ -37,10 +37,11 @@ from typing import NamedTuple
 import numpy as np
 
 from stochfuse.data.robot_errors import BLOCK, ChannelNoises
-from stochfuse.data.robots import RobotRecord, moved, seen, wrapped
-from stochfuse.fusion.cooperative import lwin_update
+from stochfuse.data.robots import RobotRecord, moved, seen
+from stochfuse.fusion.cooperative import lwin_update, over_states, place
 from stochfuse.kalman.algebra import NUMPY
 from stochfuse.kalman.kernel import Estimate, corrected, predict, update
+from stochfuse.scenario.sensing import wrapped
 
 ESTIMATORS = ("stand-alone", "naive", "covariance-intersection", "split-ci", "lwin", "itns")
 GATE = 40.0
@@ -146,7 +147,7 @@ class RobotCovariances:
     def landmark(self, i: int, H: np.ndarray, R: np.ndarray, valid: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """Take a landmark in; return the gain (items, rows, 2)."""
         if self.joint:
-            return self._joint(_spread(H, i, self.n), R, valid)
+            return self._joint(over_states(H, range(3 * i, 3 * i + 3), 3 * self.n), R, valid)
         P = self.P[:, i]
         fine = valid(H @ P @ NUMPY.transpose(H) + R)
         found = update(_unit(P, 3), H, R, np.eye(2))
@@ -167,8 +168,7 @@ class RobotCovariances:
         """Take a sighting of a robot in where messages arrived, heard (items, 2); return the gain (items, rows, 2)."""
         i, j = pair
         if self.joint:
-            whole = _spread(H[0], i, self.n) + _spread(H[1], j, self.n)
-            return self._joint(whole, R, lambda S: valid(S) & heard[:, :1, None])
+            return self._joint(place(H[0], i, H[1], j, self.n, 3), R, lambda S: valid(S) & heard[:, :1, None])
         if self.estimator == "stand-alone":
             return None
         if self.estimator == "lwin":
@@ -248,12 +248,6 @@ def _det(A: np.ndarray) -> np.ndarray:
 def _unit(P: np.ndarray, d: int) -> Estimate:
     """An error of zero, so that an update by the identity returns the gain as its state."""
     return Estimate(np.zeros((d, 2)), P)
-
-
-def _spread(H: np.ndarray, i: int, n: int) -> np.ndarray:
-    whole = np.zeros((*H.shape[:-1], 3 * n))
-    whole[..., 3 * i : 3 * i + 3] = H
-    return whole
 
 
 def _blocks(P: np.ndarray, n: int) -> np.ndarray:

@@ -36,11 +36,12 @@ from stochfuse.data.robot_filters import (
     course,
     filtered,
 )
-from stochfuse.data.robots import RobotRecord, read_robots, wrapped
+from stochfuse.data.robots import RobotRecord, read_robots
 from stochfuse.engines.progress import listener
 from stochfuse.errors import UsageError, nearest
 from stochfuse.scenario import registry
 from stochfuse.scenario.result import Result
+from stochfuse.scenario.sensing import wrapped
 
 UNTIL = 60.0
 FORGOTTEN = 10.0

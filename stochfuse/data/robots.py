@@ -30,6 +30,7 @@ import numpy as np
 
 from stochfuse.data.columns import WHOLE, ColumnField, Columns, read_columns
 from stochfuse.errors import UsageError
+from stochfuse.scenario.sensing import wrapped
 
 FILES = {
     "odometry": (ColumnField("time"), ColumnField("robot", WHOLE), ColumnField("speed"), ColumnField("turn_rate")),
@@ -133,11 +134,6 @@ class RobotRecord:
         of_robots = self.truth[sightings.step, np.minimum(sightings.subject, n - 1), :2]
         fixed = self.places[np.maximum(sightings.subject - n, 0)]
         return np.where((sightings.subject < n)[:, None], of_robots, fixed)
-
-
-def wrapped(angle: np.ndarray) -> np.ndarray:
-    """Return angles between −π and π."""
-    return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def moved(x: np.ndarray, motion: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:

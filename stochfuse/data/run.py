@@ -16,13 +16,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from stochfuse.data.consistency import Average, Series, band
-from stochfuse.data.draw import drawn_arrivals
-from stochfuse.data.records import RecordedRuns, read_records
+from stochfuse.data.draw import Draws, drawn_arrivals
+from stochfuse.data.records import RecordedRuns, Records, read_records
 from stochfuse.data.suspicions import Suspicion, suspicions
 from stochfuse.engines.progress import listener
 from stochfuse.engines.replay import ArrivalRecord, Stage, moments_given, replay
@@ -45,42 +45,8 @@ FOLLOWED = 2_000_000
 """Runs times agents times steps squared of which the error given what arrived is worked out: so does its work grow."""
 
 
-class RecordsLike(Protocol):
-    """Records of some runs, read (`stochfuse.data.records.Records`) or drawn."""
-
-    @property
-    def scenario(self) -> Scenario:
-        """What the estimators are told, with as many steps as the records have."""
-        ...
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the runs."""
-        ...
-
-    @property
-    def known(self) -> np.ndarray:
-        """Which states the truth gives."""
-        ...
-
-    @property
-    def with_truth(self) -> bool:
-        """Whether there is any truth."""
-        ...
-
-    @property
-    def given(self) -> bool:
-        """Whether arrivals come with the records."""
-        ...
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What should be known of them."""
-        ...
-
-    def batches(self) -> Iterator[RecordedRuns]:
-        """Go through the runs, some at a time."""
-        ...
+RecordsLike = Records | Draws
+"""Records of some runs, read or drawn."""
 
 
 class Row(NamedTuple):
@@ -301,7 +267,7 @@ def run_records(
 
     Parameters
     ----------
-    records : from `stochfuse.data.records.read_records`.
+    records : from `stochfuse.data.records.read_records`, or draws.
     metric : what errors are shown in.
     way : which estimators, and how.
     write : what is told every step's estimates, in the order run by run of a batch.

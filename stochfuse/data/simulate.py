@@ -7,95 +7,19 @@ extended ones, so that the realised error says how far the linearisation of a pr
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from stochfuse.data.draw import drawn, drawn_arrivals
-from stochfuse.data.records import NUMBERS, RecordedRuns
+from stochfuse.data.draw import Draws
 from stochfuse.data.run import RunResult, asked_links, run_records, way_of
 from stochfuse.data.writing import ARRIVALS, ESTIMATES, FIRST, MEASUREMENTS, TRUTH, EstimatesFile, RecordFiles
 from stochfuse.errors import UsageError
 from stochfuse.kalman.metrics import metric as metric_of
-from stochfuse.scenario.network import LinkRows
 from stochfuse.scenario.scenario import Scenario, of_scenario
 
 FILES = (MEASUREMENTS, ARRIVALS, TRUTH, FIRST, ESTIMATES)
-DEPARTS = 1e-6
-"""Largest part of its size by which a nominal path may depart from the model without a word."""
-
-
-@dataclass(frozen=True, eq=False)
-class Draws:
-    """Records that are drawn, in the form of those that are read (`stochfuse.data.records.Records`).
-
-    Parameters
-    ----------
-    scenario : what is simulated.
-    names : of the runs.
-    links : one row of link probabilities.
-    seed : of everything.
-    files : where they are written to, or None.
-    """
-
-    scenario: Scenario
-    names: tuple[str, ...]
-    links: LinkRows
-    seed: int
-    files: RecordFiles | None = None
-    given: bool = True
-    """Whether arrivals come with the records."""
-
-    @property
-    def known(self) -> np.ndarray:
-        """States of which the truth is known: all."""
-        return np.arange(self.scenario.model.dimension)
-
-    @property
-    def with_truth(self) -> bool:
-        """Whether the truth is known."""
-        return True
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What should be known of the draws."""
-        nominal, model = self.scenario.nominal, self.scenario.system.model
-        if nominal is None or len(model.F) < 2:
-            return ()
-        nominal = nominal[: len(model.F)]
-        moved = (model.F[1:] @ nominal[:-1, :, None] + model.Bu[1:])[..., 0]
-        off = float(np.abs(moved - nominal[1:]).max())
-        if off <= DEPARTS * float(np.abs(nominal).max()):
-            return ()
-        return (f"the truth follows the model; the nominal path departs from it by up to {off:.3g} in a step",)
-
-    def batches(self) -> Iterator[RecordedRuns]:
-        """Draw some runs at a time."""
-        system, runs = self.scenario.system, len(self.names)
-        size = max(1, NUMBERS // (system.agents * system.steps))
-        nominal = self.scenario.nominal
-        start = system.x0 if nominal is None else nominal[0][:, None]
-        for first in range(0, runs, size):
-            count = min(size, runs - first)
-            found = drawn(system, self.scenario.instruments, start, count, self.seed, first)
-            arrivals = drawn_arrivals(system, self.links, found.missed, self.seed, first)
-            batch = RecordedRuns(
-                np.arange(first, first + count),
-                tuple(np.nan_to_num(z) for z in found.z),
-                found.relations,
-                arrivals,
-                found.missed,
-                found.truth,
-                found.first,
-            )
-            if self.files is not None:
-                seen = [~np.isnan(z[..., 0]) for z in found.z]
-                self.files.write(batch, self.names[first : first + count], seen.__getitem__)
-            yield batch
 
 
 @of_scenario
@@ -151,7 +75,7 @@ def simulate(
     with ExitStack() as stack:
         files = stack.enter_context(RecordFiles(where, scenario))
         estimates = stack.enter_context(EstimatesFile(where / ESTIMATES, scenario, truth=True))
-        return replace(run_records(replace(draws, files=files), shown, how, estimates.write), simulated=True)
+        return replace(run_records(replace(draws, write=files.write), shown, how, estimates.write), simulated=True)
 
 
 def _check_folder(folder: Path, force: bool) -> None:

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from stochfuse.data.cells import Cell
 from stochfuse.engines.events import ChanceEvent, events
 from stochfuse.engines.monte_carlo import Experiment, sample
 from stochfuse.errors import UsageError
@@ -32,6 +33,7 @@ from stochfuse.estimators.protocol import Claims, Exchange, Late
 from stochfuse.estimators.world import claimed_only, moments
 from stochfuse.kalman.kernel import Information, at_step, corrected, gain
 from stochfuse.kalman.metrics import Metric, Moments
+from stochfuse.kalman.metrics import metric as metric_of
 from stochfuse.prediction.general import outcomes
 from stochfuse.prediction.method import Settings
 from stochfuse.scenario import capabilities
@@ -50,34 +52,6 @@ MOST_AGENTS = 3
 """Agents up to which outcomes are listed."""
 
 
-class CellMean(NamedTuple):
-    """A mean that a file has, of one link probability and step.
-
-    Parameters
-    ----------
-    quantity : "claimed", "actual" (mean squared error), "bias" or "nees".
-    metric : in which sense; of a bias that of its state.
-    step : number from 1.
-    agents : agents averaged, from 1.
-    runs : independent runs.
-    mean, error : what the file has, and its standard error.
-    expected : prediction.
-    resolution : half a unit of the last digit that the file gives.
-    expected_error : standard error of what is expected, 0 where it is not sampled.
-    """
-
-    quantity: str
-    metric: Metric
-    step: int
-    agents: tuple[int, ...]
-    runs: int
-    mean: float
-    error: float
-    expected: float
-    resolution: float = 0.0
-    expected_error: float = 0.0
-
-
 class LinkMeans(NamedTuple):
     """The cells of one link probability, which are independent of those of others.
 
@@ -91,11 +65,11 @@ class LinkMeans(NamedTuple):
 
     link: str
     row: int
-    cells: tuple[CellMean, ...]
+    cells: tuple[Cell, ...]
     values: np.ndarray | None = None
 
 
-Shown = Callable[[np.ndarray, CellMean, "Simulator"], np.ndarray]
+Shown = Callable[[np.ndarray, Cell, "Simulator"], np.ndarray]
 """What is shown in the place of some numbers of a cell."""
 
 
@@ -261,7 +235,7 @@ class Sampler:
         UsageError, NoAnswerError
             If there is no such simulator: the estimator does not take the system, or some outcome has no covariance.
         """
-        claims = {cell.metric.name for block in blocks for cell in block.cells if cell.quantity == CLAIMED}
+        claims = {cell.metric for block in blocks for cell in block.cells if cell.quantity == CLAIMED}
         if simulator.metric is not None and claims <= {simulator.metric.name}:
             raise UsageError(f"metric: expected another than {simulator.metric.name}, which is what is shown")
         histories = self._histories(simulator)
@@ -343,7 +317,7 @@ class _Reading:
     def __init__(self, simulator: Simulator) -> None:
         self.simulator = simulator
 
-    def place(self, cell: CellMean) -> _Place:
+    def place(self, cell: Cell) -> _Place:
         """Where the numbers of a cell come from."""
         s = self.simulator
         plain = s.claimed_only and cell.quantity != CLAIMED
@@ -356,7 +330,7 @@ class _Reading:
         """Whom, from 0, an agent's numbers show."""
         return self.simulator.whose[agent] - 1 if self.simulator.whose else agent
 
-    def numbers(self, cell: CellMean, place: _Place, agent: int, m: Moments) -> np.ndarray:
+    def numbers(self, cell: Cell, place: _Place, agent: int, m: Moments) -> np.ndarray:
         """Numbers of a cell from an agent's moments at a place."""
         seen = m if place.stage == FUSED else self._before(m, place.step + 1, agent, place.stage)
         numbers = self._number(cell, seen)
@@ -381,12 +355,13 @@ class _Reading:
             b = None if b is None else b - K @ (real.H @ b)
         return Moments(P) if A is None or b is None else Moments.of(P, A, b)
 
-    def _number(self, cell: CellMean, m: Moments) -> np.ndarray:
-        if cell.quantity == CLAIMED:
-            return (self.simulator.metric or cell.metric).of(m.P)
+    def _number(self, cell: Cell, m: Moments) -> np.ndarray:
         if cell.quantity == NEES:
             return np.trace(np.linalg.solve(m.P, m.square), axis1=-2, axis2=-1)
-        states = list(cell.metric.states)
+        sense = metric_of(cell.metric, self.simulator.system.model)
+        if cell.quantity == CLAIMED:
+            return (self.simulator.metric or sense).of(m.P)
+        states = list(sense.states)
         if cell.quantity == SQUARED:
             return np.trace(np.asarray(m.square)[..., states, :][..., states], axis1=-2, axis2=-1)
         return np.asarray(m.bias)[..., states[0], 0]
@@ -402,11 +377,11 @@ class _EstimateTests:
         self._fused: dict[int, Moments] = {}
         self._seen: dict[Hashable, np.ndarray] = {}
 
-    def at(self, cell: CellMean, row: int) -> np.ndarray:
+    def at(self, cell: Cell, row: int) -> np.ndarray:
         """What every run of a row shows in a cell, (runs,)."""
         return np.mean([self._one(cell, row, self.reading.agent(a - 1)) for a in cell.agents], axis=0)
 
-    def _one(self, cell: CellMean, row: int, agent: int) -> np.ndarray:
+    def _one(self, cell: Cell, row: int, agent: int) -> np.ndarray:
         s, runs = self.simulator, self.histories.which.shape[1]
         if AS_IT_WAS in s.habits and cell.quantity != CLAIMED:
             # what was not brought forward is wrong by the true state's own motion, which no footprint knows
@@ -416,7 +391,7 @@ class _EstimateTests:
             start = self.reading.numbers(cell, place, agent, _start(s, self.of is moments))
             return np.full(runs, float(start))
         kind = s.system.sensor_of[agent] if place.stage == LOCAL else -1
-        key = (place, kind, cell.quantity, cell.metric.name, cell.step, cell.runs, cell.agents)
+        key = (place, kind, cell.quantity, cell.metric, cell.step, cell.runs, cell.agents)
         if key not in self._seen:
             self._seen[key] = self.reading.numbers(cell, place, agent, self._at(place.step))
         return self._seen[key][self.histories.steps[place.step - 1][1][row, :, agent]]
@@ -448,16 +423,17 @@ def exactly(simulator: Simulator, blocks: Sequence[LinkMeans]) -> list[np.ndarra
     found = outcomes(s.system, s.rows, Settings(estimator=s.estimator, criterion=s.criterion))
     seen: dict[Hashable, np.ndarray] = {}
 
-    def one(cell: CellMean, agent: int) -> np.ndarray:
+    def one(cell: Cell, agent: int) -> np.ndarray:
         place = reading.place(cell)
         if place.step == 0:
             start = reading.numbers(cell, place, agent, _start(s, False))
             return np.full(len(s.rows.link), float(start))
         group = next(g for g, members in enumerate(found.groups) if agent in members)
-        key = (place, group, cell.metric.name, cell.step, cell.runs, cell.agents)
+        key = (place, group, cell.metric, cell.step, cell.runs, cell.agents)
         if key not in seen:
-            of = replace(cell.metric, of=lambda P: reading.numbers(cell, place, agent, Moments(P)))
-            seen[key] = found.distribution(of, place.step, [group]).mean()
+            sense = metric_of(cell.metric, s.system.model)
+            shown = replace(sense, of=lambda P: reading.numbers(cell, place, agent, Moments(P)))
+            seen[key] = found.distribution(shown, place.step, [group]).mean()
         return seen[key]
 
     return [

@@ -205,9 +205,9 @@ def _unknown(trial: _CaseSuspicions) -> Suspicion:
     return Suspicion("unknown", seeing[place] + 1, text, explains=False)
 
 
-def _wrong(now: Innovations, case: int = 0) -> bool:
+def _wrong(now: Innovations) -> bool:
     """Whether innovations are by far not white of variance 1, of all agents or one."""
-    white = now.white[case]
+    white = now.white[0]
     n = white.shape[2]
     looks = n * (1 + 2 * white.shape[3]) + 1
     far = -ndtri(CHANCE / looks / 2.0)

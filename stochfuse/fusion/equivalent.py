@@ -41,7 +41,7 @@ import numpy as np
 from scipy.optimize import root_scalar
 
 from stochfuse.errors import NoAnswerError, UsageError
-from stochfuse.fusion.blender import RANK, blend_all, references, semidefinite, spectrum
+from stochfuse.fusion.blender import RANK, blend_all, references, semidefinite, size_of, spectrum
 from stochfuse.kalman.algebra import NUMPY
 
 REACH = 1e8
@@ -142,11 +142,10 @@ def _checked(R: np.ndarray, Delta: np.ndarray | None, sensors: int) -> tuple[np.
     """R and Δ as checked matrices."""
     R = semidefinite("R", R)
     if R.ndim != 2 or sensors < 1 or not R.size or len(R) % sensors:
-        shape = "×".join(map(str, R.shape))
-        raise UsageError(f"R: expected {sensors} sensors' blocks of one size, got a {shape} matrix")
+        raise UsageError(f"R: expected {sensors} sensors' blocks of one size, got a {size_of(R)} matrix")
     D = np.zeros_like(R) if Delta is None else semidefinite("Delta", Delta)
     if D.shape != R.shape:
-        raise UsageError(f"Delta: expected a {len(R)}×{len(R)} matrix as R is, got {'×'.join(map(str, D.shape))}")
+        raise UsageError(f"Delta: expected a {len(R)}×{len(R)} matrix as R is, got {size_of(D)}")
     if spectrum(R + D, np.diagonal(R + D))[0].min() <= RANK:
         raise UsageError("R + Delta: expected a positive definite matrix, got a singular one")
     return R, D

@@ -2,16 +2,14 @@
 
 Newton's method runs on faces of the simplex: a weight that reaches zero is held there, and released when its slope
 asks for it.  All problems of a stack move together, each with its own face.  The largest eigenvalue is smoothed
-(`stochfuse.fusion.intersection_weights`) with µ falling to 1e-11 of its value; at a double eigenvalue a small µ
-leaves a
-bias of µ and amplifies rounding to 1e-16/µ, so the weights of least certificate among the last stages are kept.
+(below) with µ falling to 1e-11 of its value; at a double eigenvalue a small µ leaves a bias of µ and amplifies
+rounding to 1e-16/µ, so the weights of least certificate among the last stages are kept.
 
 Certificate.  Convexity gives φ(ω*) ≥ φ(ω) + min_i ∂φ/∂ω_i − Σ ω_i ∂φ/∂ω_i at any ω; what is missing to equality is the
 residual of the optimality conditions and bounds the excess over the optimum.
 
-Criteria of (split) covariance intersection as functions of the weights, with their first and second derivatives.
-
-Each signal is a sum of directions v of information, so that
+The criteria as functions of the weights, with their first and second derivatives.  Each signal is a sum of directions
+v of information, so that
 
     Y(ω) = C⁻¹ = Σ_k g_k(ω) v_k v_kᵀ       g(ω) = ω/(α + ω(1 − α))       0 ≤ α ≤ 1,
 

@@ -11,8 +11,8 @@ Doors: `scenario.load_scenario` (a preset, a file, a mapping → `Scenario`) and
 engines see).  `schema` says which keys there are, `tables`, `motion` and `sensing` (models and sensors by name),
 `cooperative` and `navigation` read them, `checker` remembers what was wrong, `model` and `network` are what comes of
 it.  `registry` declares what can be asked of a scenario, `capabilities` what takes what.  `links` reads packet logs,
-`known_links` those of scenarios too, `radio` works them out, `adapters` take what people have in Python; `result` is
-what whatever can be shown has in common.
+`known_links` those of scenarios too, `link_memory` tells their bursts, `radio` works links out, `adapters` take what
+people have in Python; `result` is what whatever can be shown has in common.
 
 It knows the kernel and the rules of fusion.  A new key: its field in `schema`, its reading in `tables`, its place in
 `Scenario` and, where engines need it, in `System`; a feature that not everybody takes: its entry in `capabilities`.  A

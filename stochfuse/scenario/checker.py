@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from stochfuse.errors import Problem
 from stochfuse.kalman.checks import LARGEST, MOST, covariance_fault, shown, size
+
+
+def table_of(mapping: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    """Return a table within another; empty where there is none, or something else, which its structure tells."""
+    inner = mapping.get(key)
+    return inner if isinstance(inner, Mapping) else {}
+
+
+def tables_of(value: Any) -> list[Mapping[str, Any]]:
+    """Return a list of tables, empty ones in the place of what is none."""
+    return [each if isinstance(each, Mapping) else {} for each in (value if isinstance(value, list | tuple) else ())]
 
 
 class Checker:
@@ -25,6 +36,12 @@ class Checker:
         """Remember one problem, unless something is known to be wrong there already."""
         if path not in self._skip and all(problem.path != path for problem in self.problems):
             self.problems.append(Problem(path, expected, got))
+
+    def absent(self, path: str, table: Mapping[str, Any], keys: Iterable[str], expected: str) -> None:
+        """Note keys of a table that must not be given."""
+        for key in keys:
+            if table.get(key) is not None:
+                self.note(f"{path}.{key}", expected, shown(table[key]))
 
     def array(self, path: str, value: Any, expected: str) -> np.ndarray | None:
         """Any array of finite floats."""
@@ -46,6 +63,18 @@ class Checker:
             return None
         array.setflags(write=False)
         return array
+
+    def number(
+        self, path: str, value: Any, expected: str, fits: Callable[[Any], Any] = lambda number: True
+    ) -> float | None:
+        """Read one finite number that fits."""
+        array = self.array(path, value, expected)
+        if array is None:
+            return None
+        if array.ndim or not fits(array):
+            self.note(path, expected, shown(value))
+            return None
+        return float(array)
 
     def matrix(
         self, path: str, value: Any, rows: int | None, columns: int | None, steps: int, *, identity: bool = False
@@ -111,6 +140,13 @@ class Checker:
         else:
             return array[..., None]
         return None
+
+    def place(self, path: str, value: Any, axes: int, steps: int) -> np.ndarray | None:
+        """Read coordinates (axes,), or as many per step (steps, axes)."""
+        found = self.vector(path, value, axes, steps)
+        if found is None:
+            return None
+        return found[:steps, :, 0] if found.ndim == 3 else found[:, 0]
 
     def series(self, path: str, value: Any, expected: str, steps: int) -> np.ndarray | None:
         """Read a number, or one for each step: an array of shape () or (steps,)."""

@@ -29,21 +29,12 @@ from stochfuse.fusion.cooperative import (
     together,
 )
 from stochfuse.kalman.checks import shown
-from stochfuse.scenario.checker import Checker
+from stochfuse.scenario.checker import Checker, tables_of
 
-
-class Relations(NamedTuple):
-    """The cooperative measurements of a network.
-
-    Parameters
-    ----------
-    positions : indices of the states that are the place; empty where nothing depends on it.
-    pairs : for observer i and other j, counted from 0, the relation over the full state: H_i, H_j of shape (p, d), or
-        (steps, p, d) where a place is given per step, and R (p, p).  An ordered pair that is left out measures nothing.
-    """
-
-    positions: tuple[int, ...]
-    pairs: dict[tuple[int, int], Relation]
+Relations = dict[tuple[int, int], Relation]
+"""What observer i measures of other j, counted from 0, over the full state: H_i, H_j of shape (p, d), or (steps, p, d)
+where a place is given per step, and R (p, p).  An ordered pair that is left out measures nothing.
+"""
 
 
 class _RelationNoise(NamedTuple):
@@ -91,7 +82,7 @@ def read_cooperative(
     Relations or None
         None without [cooperative], or where something essential is wrong, which the checker has noted.
     """
-    nodes = [node if isinstance(node, dict) else {} for node in _listed(agent_tables)]
+    nodes = tables_of(agent_tables)
     if not isinstance(table, Mapping):
         placed = [i for i, node in enumerate(nodes, start=1) if node.get("position") is not None]
         if table is None and placed:
@@ -102,11 +93,9 @@ def read_cooperative(
     if where is None:
         return None
     if noises and not any(isinstance(noise, _RelationNoise) and noise.kind for noise in noises.values()):
-        return Relations((), {pair: _related(noise, where, None, None) for pair, noise in noises.items()})
+        return {pair: _related(noise, where, None, None) for pair, noise in noises.items()}
     places = _places(check, nodes, len(where.positions), agents, steps)
-    if places is None:
-        return None
-    return Relations(where.positions, _relations(check, noises, places, where))
+    return None if places is None else _relations(check, noises, places, where)
 
 
 def _states(
@@ -156,8 +145,9 @@ def _noises(
     common = _noise(check, "cooperative", table)
     noises: dict[tuple[int, int], Any] = dict.fromkeys(permutations(range(agents), 2), common)
     listed = set()
-    for k, pair in enumerate(_listed(table.get("pair")), start=1):
-        if not isinstance(pair, dict):
+    given = table.get("pair")
+    for k, pair in enumerate(given if isinstance(given, list | tuple) else (), start=1):
+        if not isinstance(pair, Mapping):
             continue
         path = f"cooperative.pair[{k}]"
         noise = _pair_noise(check, path, pair, d)
@@ -170,10 +160,6 @@ def _noises(
         listed |= ways
         noises.update(dict.fromkeys(ways, noise))
     return {pair: noise for pair, noise in noises.items() if noise is not None}
-
-
-def _listed(value: Any) -> Sequence[Any]:
-    return value if isinstance(value, list | tuple) else ()
 
 
 def _measures(table: Mapping[str, Any]) -> bool:
@@ -219,19 +205,11 @@ def _linear(check: Checker, path: str, pair: Mapping[str, Any], d: int) -> Relat
 
 
 def _noise(check: Checker, path: str, table: Mapping[str, Any]) -> _RelationNoise | None:
-    noise = _RelationNoise(*(_deviation(check, f"{path}.{key}", table.get(key)) for key in _RelationNoise._fields))
-    return noise if any(sigma is not None for sigma in noise) else None
-
-
-def _deviation(check: Checker, path: str, value: Any) -> float | None:
     expected = "a positive standard deviation"
-    array = check.array(path, value, expected)
-    if array is None:
-        return None
-    if array.ndim or array <= 0:
-        check.note(path, expected, shown(value))
-        return None
-    return float(array)
+    noise = _RelationNoise(
+        *(check.number(f"{path}.{key}", table.get(key), expected, lambda σ: σ > 0) for key in _RelationNoise._fields)
+    )
+    return noise if any(sigma is not None for sigma in noise) else None
 
 
 def _ends(check: Checker, path: str, value: Any, agents: int) -> tuple[int, int] | None:
@@ -248,7 +226,9 @@ def _ends(check: Checker, path: str, value: Any, agents: int) -> tuple[int, int]
     return first - 1, second - 1
 
 
-def _places(check: Checker, nodes: list[Any], coordinates: int, agents: int, steps: int) -> list[np.ndarray] | None:
+def _places(
+    check: Checker, nodes: Sequence[Mapping[str, Any]], coordinates: int, agents: int, steps: int
+) -> list[np.ndarray] | None:
     """Return every agent's place, (D,) or (steps, D)."""
     if len(nodes) != agents:
         # reading the sensors notes a wrong number of tables, but not that there are none
@@ -263,9 +243,8 @@ def _places(check: Checker, nodes: list[Any], coordinates: int, agents: int, ste
             continue
         if node.get("position") is None:
             check.note(path, f"a list of {coordinates} numbers, since [cooperative] is given", "nothing")
-        place = check.vector(path, node.get("position"), coordinates, steps)
-        if place is not None:
-            places.append(place[:steps, :, 0] if place.ndim == 3 else place[:, 0])
+        place = check.place(path, node.get("position"), coordinates, steps)
+        places += [] if place is None else [place]
     return places if len(places) == agents else None
 
 
@@ -274,7 +253,7 @@ def _relations(
     noises: Mapping[tuple[int, int], _RelationNoise | Relation],
     places: Sequence[np.ndarray],
     where: _StateIndices,
-) -> dict[tuple[int, int], Relation]:
+) -> Relations:
     related, refused = {}, set()
     for (i, j), noise in noises.items():
         if isinstance(noise, Relation) or not noise.kind:

@@ -4,20 +4,12 @@ Of n packets that a sender sent while a receiver listened s arrived: µ̂ = s/n,
 Beta(s + ½, n − s + ½) gives the interval.  A link of which nothing is known is unknown (NaN), never 0; a receiver
 that listened and heard nothing of n packets is 0 of n.
 
-Memory: of successive packets n_ab followed an a by a b (0 lost, 1 received).  Without memory the second does not
-depend on the first; the likelihood ratio 2 Σ n_ab ln(n_ab n / n_a· n_·b) is then χ² of one degree of freedom.  Where
-it says otherwise, a link is fitted by two states, good and bad,
-
-    Gilbert          delivery 1 and 0: p = n_10 / n_1·, r = n_01 / n_0·
-    Gilbert–Elliott  deliveries of their own, by Baum–Welch from several starts,
-
-and the Bayesian information criterion −2 ln L + k ln n chooses between none (k = 1), Gilbert (2) and Gilbert–Elliott
-(4).
+Whether a link has a memory, and which two states explain it: `stochfuse.scenario.link_memory`.
 
 Files are known by their headers: logs `seq,sender,receiver,received` or, of received packets alone,
 `seq,sender,receiver` (the numbers between a sender's first and last were sent; a counter of 16 bits may wrap);
 Mercator raw logs; k7 files of ratios; edge lists `receiver,sender,link`; matrices with the nodes' names in the first
-row and column, receivers downwards.  Arrow reads them (extra `study`).
+row and column, receivers downwards.  Arrow reads them where it is installed (extra `study`), else Python's own csv.
 """
 
 from __future__ import annotations
@@ -25,6 +17,7 @@ from __future__ import annotations
 import csv
 import gzip
 import io
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,17 +25,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stochfuse.errors import Problem, ScenarioError, UsageError, nearest, needed
+from stochfuse.errors import Problem, ScenarioError, StochfuseError, UsageError, nearest, needed
+from stochfuse.scenario.link_memory import MEMORY as MEMORY
+from stochfuse.scenario.link_memory import memory_of
 from stochfuse.scenario.result import Result
 
 if TYPE_CHECKING:
     from stochfuse.scenario.radio import Radio
 
 CONFIDENCE = 0.95
-MEMORY = 3.841458820694124
-"""95 % point of χ² with one degree of freedom."""
-LONGEST, RESTARTS, ROUNDS = 2000, 4, 100
-"""Packets of a link that Baum–Welch looks at, its starts, and its steps."""
 LONGEST_LINE = 1 << 20
 """Letters of a line of text beyond which a file is none of these."""
 WRAP = 1 << 16
@@ -257,7 +248,7 @@ def read_links(
     UsageError
         If the file is none of these; with line and column.
     StochfuseError
-        If pyarrow is not installed.
+        If it is Parquet, and pyarrow is not installed.
     """
     name, text, table = _opened(source)
     if table is None and text.lstrip("\ufeff").startswith("{"):
@@ -321,16 +312,20 @@ def _opened(source: str | Path) -> tuple[str, str, dict[str, list[Any]] | None]:
 
 def _table(name: str, text: str) -> dict[str, Any]:
     """Columns of text by their names."""
-    arrow, arrow_csv = _arrow("pyarrow"), _arrow("pyarrow.csv")
-    header = text.lstrip("\ufeff").partition("\n")[0].rstrip("\r")
+    text = text.lstrip("\ufeff")
+    header = text.partition("\n")[0].rstrip("\r")
     if len(header) > LONGEST_LINE:
         raise UsageError(f"{name}, line 1: expected a line of headings, got {len(header):,} letters")
     heads = [_one_line(head).strip('"') for head in header.split(",")]
     if len(set(heads)) < len(heads):
         raise UsageError(f"{name}, line 1: expected different headings, got {header[:80]}")
     try:
+        arrow, arrow_csv = _arrow("pyarrow"), _arrow("pyarrow.csv")
+    except StochfuseError:
+        return _by_csv(name, text, heads)
+    try:
         found = arrow_csv.read_csv(
-            io.BytesIO(text.lstrip("\ufeff").encode()),
+            io.BytesIO(text.encode()),
             read_options=arrow_csv.ReadOptions(column_names=heads, skip_rows=1, block_size=LONGEST_LINE * 16),
             convert_options=arrow_csv.ConvertOptions(
                 column_types=dict.fromkeys(heads, arrow.string()), strings_can_be_null=False
@@ -339,6 +334,14 @@ def _table(name: str, text: str) -> dict[str, Any]:
     except arrow.ArrowInvalid as error:
         raise UsageError(f"{name}{_torn(text, len(heads)) or f': {_one_line(str(error))[:160]}'}") from None
     return {head: found[head] for head in heads}
+
+
+def _by_csv(name: str, text: str, heads: list[str]) -> dict[str, Any]:
+    torn = _torn(text, len(heads))
+    if torn:
+        raise UsageError(f"{name}{torn}")
+    rows = [row for row in csv.reader(io.StringIO(text, newline="")) if row][1:]
+    return {head: np.array([row[i] for row in rows], dtype=str) for i, head in enumerate(heads)}
 
 
 def _torn(text: str, columns: int) -> str:
@@ -430,7 +433,7 @@ def links_of_packets(table: Mapping[str, Any], *, source: str = "table", step: f
                 numbers.append(np.arange(len(flags)))
                 arrived.append(flags)
             bits = (np.concatenate(pairs), np.concatenate(numbers), np.concatenate(arrived)) if pairs else None
-    memory, burst = (None, None) if bits is None else _memory(*bits, n)
+    memory, burst = (None, None) if bits is None else memory_of(*bits, n)
     delay = _delays(source, table, step)
     return _counted(
         source, "packet log", nodes, sent, heard, memory=memory, burst=burst, delay=delay, notes=tuple(notes)
@@ -443,6 +446,12 @@ def _counted(
     low, high = jeffreys(sent, received)
     link = np.divide(received, sent, out=np.full(sent.shape, np.nan), where=sent > 0)
     return Links(source, kind, tuple(map(str, nodes)), link, low, high, sent, received, **more)
+
+
+def _uncounted(source: str, kind: str, nodes: Sequence[str], link: np.ndarray, **more: Any) -> Links:
+    """Links of which no number of packets is known, and so no interval."""
+    unknown = np.full_like(link, np.nan)
+    return Links(source, kind, tuple(nodes), link, unknown, unknown, **more)
 
 
 def jeffreys(sent: np.ndarray, received: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -494,8 +503,7 @@ def _k7(name: str, table: Mapping[str, Any], sent: int | None) -> Links:
     mean = np.bincount(pair, ratio, minlength=n * n).reshape(n, n)
     link = np.divide(mean, rows, out=np.full((n, n), np.nan), where=rows > 0)
     note = "ratios without numbers of packets: no interval; --sent N says how many each stands for"
-    unknown = np.full((n, n), np.nan)
-    return Links(name, "k7 ratios", tuple(nodes), link, unknown, unknown, notes=(note,))
+    return _uncounted(name, "k7 ratios", nodes, link, notes=(note,))
 
 
 def _edges(name: str, table: Mapping[str, Any]) -> Links:
@@ -508,7 +516,7 @@ def _edges(name: str, table: Mapping[str, Any]) -> Links:
     again[first] = False
     _refuse(name, "link", values, again, "each link once")
     link[r, s] = values
-    return Links(name, "edge list", tuple(nodes), link, np.full_like(link, np.nan), np.full_like(link, np.nan))
+    return _uncounted(name, "edge list", nodes, link)
 
 
 def _matrix_rows(table: Mapping[str, Any]) -> tuple[list[str], list[str], list[list[str]]] | None:
@@ -537,7 +545,7 @@ def _matrix(name: str, rows: list[str], heads: list[str], cells: list[list[str]]
             if not 0 <= link[i, j] <= 1:
                 where, got = f"{name}, line {i + 2}, column '{heads[j]}'", cell.strip()[:40]
                 raise UsageError(f"{where}: expected a probability between 0 and 1, got '{got}'")
-    return Links(name, "matrix", tuple(rows), link, np.full_like(link, np.nan), np.full_like(link, np.nan))
+    return _uncounted(name, "matrix", rows, link)
 
 
 def _listed(column: Any) -> list[Any]:
@@ -545,13 +553,8 @@ def _listed(column: Any) -> list[Any]:
 
 
 def _words(name: str, table: Mapping[str, Any], column: str) -> np.ndarray:
-    if column not in table:
-        raise UsageError(f"{name}: expected a column {column}, got {', '.join(map(str, table))}")
-    given = table[column]
-    words = given.to_numpy() if hasattr(given, "to_numpy") else np.asarray(given)
-    words = np.asarray(words).astype(str)
-    _refuse(name, column, words, np.isin(np.char.strip(words), NOTHING), "a name")
-    return np.char.strip(words) if words.size else words
+    names, codes = _coded(name, table, column)
+    return np.array(names)[codes]
 
 
 def _numbers(
@@ -633,7 +636,6 @@ def _one_line(text: str) -> str:
 
 def _natural(nodes: Sequence[str] | np.ndarray) -> tuple[list[str], np.ndarray]:
     """Names in the order that a reader expects (2 before 10), and the new place of each."""
-    import re
 
     def key(name: str) -> list[tuple[int, int, str]]:
         # longer numbers are larger
@@ -704,115 +706,6 @@ def _unwrapped(sender: np.ndarray, seq: np.ndarray, table: Mapping[str, Any], so
     return out
 
 
-def _memory(pair: np.ndarray, seq: np.ndarray, got: np.ndarray, n: int) -> tuple[np.ndarray, dict | None]:
-    """Likelihood ratio for memory of every link, and the two-state models of those that have some."""
-    order = np.lexsort((seq, pair))
-    pair, got = pair[order], got[order].astype(int)
-    same = pair[1:] == pair[:-1]
-    counts = np.zeros((n * n, 2, 2))
-    np.add.at(counts, (pair[1:][same], got[:-1][same], got[1:][same]), 1)
-    total = counts.sum(axis=(1, 2), keepdims=True)
-    expected = counts.sum(axis=2, keepdims=True) * counts.sum(axis=1, keepdims=True) / np.maximum(total, 1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        terms = np.where(counts > 0, counts * np.log(counts / expected), 0.0)
-    ratio = 2 * terms.sum(axis=(1, 2))
-    # where the criterion prefers no memory to the best chain, two hidden states need not be tried
-    remembering = np.flatnonzero(ratio > np.maximum(MEMORY, np.log(np.maximum(total[:, 0, 0], 1))))
-    starts = np.searchsorted(pair, remembering), np.searchsorted(pair, remembering, side="right")
-    records = [got[a:b][:LONGEST] for a, b in zip(*starts, strict=True)]
-    fits = dict(zip(remembering.tolist(), _two_states(records, counts[remembering]), strict=True))
-    found = {divmod(place, n): fit for place, fit in fits.items() if fit is not None}
-    shown = np.where(total[:, 0, 0] > 0, ratio, np.nan).reshape(n, n)
-    return shown, found or None
-
-
-def _two_states(records: Sequence[np.ndarray], counts: np.ndarray) -> list[dict[str, float] | None]:
-    """The two-state model that BIC prefers for each record of 0 and 1; None where it prefers none."""
-    if not records:
-        return []
-    fitted = _baum_welch(records)
-    out: list[dict[str, float] | None] = []
-    for record, whole, (model, likelihood) in zip(records, counts, fitted, strict=True):
-        n, s = len(record), int(record.sum())
-        none, c = _log(s, n), np.zeros((2, 2))
-        np.add.at(c, (record[:-1], record[1:]), 1)
-        p, r = (whole[1, 0] / max(whole[1].sum(), 1), whole[0, 1] / max(whole[0].sum(), 1))
-        first = np.log(max(s if record[0] else n - s, 1) / n)
-        gilbert = first + _log(c[1, 0], c[1].sum()) + _log(c[0, 1], c[0].sum())
-        scores = {
-            "none": np.log(n) - 2 * none,
-            "gilbert": 2 * np.log(n) - 2 * gilbert,
-            "elliott": 4 * np.log(n) - 2 * likelihood,
-        }
-        best = min(scores, key=lambda name: scores[name])
-        if best == "gilbert" and 0 < p < 1 and 0 < r < 1:
-            out.append({"good_to_bad": float(p), "bad_to_good": float(r), "good": 1.0, "bad": 0.0})
-        elif best == "elliott":
-            out.append(model)
-        else:
-            out.append(None)
-    return out
-
-
-def _log(s: float, n: float) -> float:
-    """Log-likelihood of s of n at their own ratio."""
-    if not n or s in (0, n):
-        return 0.0
-    return float(s * np.log(s / n) + (n - s) * np.log(1 - s / n))
-
-
-def _baum_welch(records: Sequence[np.ndarray]) -> list[tuple[dict[str, float], float]]:
-    """Gilbert–Elliott models of largest likelihood, all records and starts side by side."""
-    longest = max(map(len, records))
-    seen = np.zeros((len(records), longest), dtype=int)
-    there = np.zeros((len(records), longest), dtype=bool)
-    for i, record in enumerate(records):
-        seen[i, : len(record)], there[i, : len(record)] = record, True
-    seen, there = np.repeat(seen, RESTARTS, axis=0), np.repeat(there, RESTARTS, axis=0)
-    starts = np.array([(0.1, 0.1, 0.95, 0.2), (0.3, 0.3, 0.9, 0.4), (0.02, 0.2, 0.99, 0.05), (0.2, 0.02, 0.8, 0.1)])
-    p, r, good, bad = np.tile(starts[:RESTARTS], (len(records), 1)).T.copy()
-    likelihood = np.full(len(p), -np.inf)
-    for _ in range(ROUNDS):
-        T = np.stack([np.stack([1 - p, p], -1), np.stack([r, 1 - r], -1)], axis=1)  # (items, from, to), good first
-        E = np.stack([good, bad], -1)
-        emitted = np.where(seen[:, :, None] == 1, E[:, None], 1 - E[:, None])
-        emitted = np.where(there[:, :, None], emitted, 1.0)
-        alpha, scale = np.empty((longest, len(p), 2)), np.empty((longest, len(p)))
-        state = np.stack([r, p], -1) / (p + r)[:, None]
-        for t in range(longest):
-            state = state * emitted[:, t] if t == 0 else (state[:, None] @ T)[:, 0] * emitted[:, t]
-            scale[t] = state.sum(axis=1)
-            state = state / scale[t][:, None]
-            alpha[t] = state
-        new = np.where(there.T, np.log(scale), 0.0).sum(axis=0)
-        if (new - likelihood < 1e-6 * np.maximum(1, np.abs(new))).all():
-            break
-        likelihood = new
-        beta = np.ones((len(p), 2))
-        moves, visits, hits = np.zeros((len(p), 2, 2)), np.zeros((len(p), 2)), np.zeros((len(p), 2))
-        for t in range(longest - 1, -1, -1):
-            gamma = alpha[t] * beta
-            gamma /= gamma.sum(axis=1, keepdims=True)
-            visits += np.where(there[:, t, None], gamma, 0)
-            hits += np.where((there[:, t] & (seen[:, t] == 1))[:, None], gamma, 0)
-            if t:
-                flow = alpha[t - 1][:, :, None] * T * (emitted[:, t] * beta)[:, None] / scale[t][:, None, None]
-                moves += np.where(there[:, t, None, None], flow, 0)
-                beta = (T @ (emitted[:, t] * beta)[:, :, None])[:, :, 0] / scale[t][:, None]
-        out = moves.sum(axis=2)
-        tiny = 1e-6
-        p, r = (np.clip(moves[:, a, 1 - a] / np.maximum(out[:, a], 1e-12), tiny, 1 - tiny) for a in (0, 1))
-        good, bad = (np.clip(hits[:, a] / np.maximum(visits[:, a], 1e-12), tiny, 1 - tiny) for a in (0, 1))
-    best = likelihood.reshape(-1, RESTARTS).argmax(axis=1) + RESTARTS * np.arange(len(records))
-    found = []
-    for i in best:
-        model = {"good_to_bad": p[i], "bad_to_good": r[i], "good": good[i], "bad": bad[i]}
-        if model["good"] < model["bad"]:
-            model = {"good_to_bad": r[i], "bad_to_good": p[i], "good": bad[i], "bad": good[i]}
-        found.append(({key: float(value) for key, value in model.items()}, float(likelihood[i])))
-    return found
-
-
 def _delays(source: str, table: Mapping[str, Any], step: float | None) -> tuple[float, ...] | None:
     if step is None:
         return None
@@ -832,4 +725,4 @@ def _delays(source: str, table: Mapping[str, Any], step: float | None) -> tuple[
 
 
 def _arrow(name: str) -> Any:
-    return needed(name, "study", "files of links need")
+    return needed(name, "study", "Parquet files of links need")

@@ -43,7 +43,7 @@ import numpy as np
 
 from stochfuse.kalman.checks import LARGEST, shown
 from stochfuse.scenario.checker import Checker
-from stochfuse.scenario.model import Model
+from stochfuse.scenario.model import Model, over_steps
 
 ORDERS = {"random-walk": 1, "constant-velocity": 2, "constant-acceleration": 3, "coordinated-turn": 2}
 """States of each axis, by kind of model."""
@@ -217,9 +217,7 @@ def read_motion(check: Checker, table: Mapping[str, Any], steps: int) -> Motion 
         None where something is wrong, which the checker has noted.
     """
     kind = check.choice("model.kind", table.get("kind"), tuple(ORDERS))
-    for key in ("F", "Q", "G"):
-        if table.get(key) is not None:
-            check.note(f"model.{key}", "nothing, since model.kind gives F and Q", shown(table[key]))
+    check.absent("model", table, ("F", "Q", "G"), "nothing, since model.kind gives F and Q")
     axes = _axes(check, kind, table.get("axes", 2))
     T = read_step(check, table, steps)
     noise_kind = check.choice("model.noise_kind", table.get("noise_kind", NOISES[0]), NOISES)
@@ -238,13 +236,6 @@ def read_motion(check: Checker, table: Mapping[str, Any], steps: int) -> Motion 
         states=tuple(BEFORE[order] + axis for axis in AXES[:axes] for order in orders),
         units=tuple(UNITS[order] for _ in range(axes) for order in orders),
     )
-
-
-def refuse_keys_of_kinds(check: Checker, table: Mapping[str, Any]) -> None:
-    """Note keys of [model] that say nothing without a kind."""
-    for key in KEYS:
-        if table.get(key) is not None:
-            check.note(f"model.{key}", "nothing without model.kind", shown(table[key]))
 
 
 def _axes(check: Checker, kind: str | None, value: Any) -> int | None:
@@ -278,13 +269,7 @@ def _noise(check: Checker, value: Any) -> float | None:
     if value is None:
         check.note("model.noise", expected, "nothing")
         return None
-    noise = check.array("model.noise", value, expected)
-    if noise is None:
-        return None
-    if noise.ndim or not 0 <= noise <= LOUDEST:
-        check.note("model.noise", expected, shown(value))
-        return None
-    return float(noise)
+    return check.number("model.noise", value, expected, lambda noise: 0 <= noise <= LOUDEST)
 
 
 def _turn_rate(check: Checker, kind: str | None, value: Any, steps: int) -> np.ndarray | None:
@@ -381,7 +366,7 @@ def _moved(model: Model, start: Mapping[tuple[int, ...], np.ndarray], steps: int
     x = np.zeros((model.dimension, 1))
     for states, values in start.items():
         x[list(states), 0] = values
-    F, Bu = (np.broadcast_to(M, (steps, *M.shape)) if M.ndim == 2 else M for M in (model.F, model.Bu))
+    F, Bu = (over_steps(M, steps) for M in (model.F, model.Bu))
     path = [x]
     with np.errstate(over="ignore", invalid="ignore"):
         for k in range(1, steps):

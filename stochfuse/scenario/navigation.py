@@ -11,6 +11,7 @@ Keys and units are those of `stochfuse.scenario.schema`; the mathematics is `sto
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ from stochfuse.errors import UsageError
 from stochfuse.fusion.inertial import ErrorModel, ImuGrade, InitialErrors, error_model
 from stochfuse.fusion.trajectory import Leg, trajectory
 from stochfuse.kalman.checks import shown
-from stochfuse.scenario.checker import Checker
+from stochfuse.scenario.checker import Checker, table_of, tables_of
 
 MOST_TICKS = 1_000_000
 """Most propagation ticks: beyond, memory and patience end."""
@@ -75,8 +76,8 @@ def read_navigation(check: Checker, table: Mapping[str, Any], steps: int) -> Err
     before = len(check.problems)
     numbers = _numbers(check, "navigation", table, _NAVIGATION)
     legs = _legs(check, table.get("leg"))
-    imu = _numbers(check, "navigation.imu", _table(table, "imu"), _IMU)
-    initial = _initial(check, _table(table, "initial"))
+    imu = _numbers(check, "navigation.imu", table_of(table, "imu"), _IMU)
+    initial = _initial(check, table_of(table, "initial"))
     ticks = _ticks(check, numbers, steps)
     complete = len(numbers) == len(_NAVIGATION) and len(imu) == len(_IMU)
     if len(check.problems) > before or not complete or not legs or initial is None or ticks is None:
@@ -117,27 +118,18 @@ def _drift(imu: Mapping[str, float], sensor: str) -> tuple[float, float, float]:
     return imu[f"{sensor}_bias"], imu[f"{sensor}_instability"], imu[f"{sensor}_time"]
 
 
-def _table(table: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    inner = table.get(key)
-    return inner if isinstance(inner, Mapping) else {}
-
-
 def _numbers(check: Checker, path: str, table: Mapping[str, Any], ranges: Mapping[str, _Range]) -> dict[str, float]:
     """Return the numbers that are right, each within its range or its default."""
     numbers = {}
     for key, bounds in ranges.items():
         value = table.get(key, bounds.default)
-        array = check.array(f"{path}.{key}", value, str(bounds))
-        if array is None:
-            continue
-        if array.ndim or not _within(array, bounds):
-            check.note(f"{path}.{key}", str(bounds), shown(value))
-        else:
-            numbers[key] = float(array)
+        number = check.number(f"{path}.{key}", value, str(bounds), partial(_within, bounds))
+        if number is not None:
+            numbers[key] = number
     return numbers
 
 
-def _within(array: np.ndarray, bounds: _Range) -> bool:
+def _within(bounds: _Range, array: np.ndarray) -> bool:
     lower = array > bounds.low if bounds.open else array >= bounds.low
     return bool((lower & (array <= bounds.high)).all())
 
@@ -146,8 +138,8 @@ def _legs(check: Checker, value: Any) -> list[Leg]:
     if isinstance(value, list) and not value:
         check.note("navigation.leg", "at least one [[navigation.leg]] table", "none")
     legs = []
-    for i, table in enumerate(value if isinstance(value, list) else [], start=1):
-        numbers = _numbers(check, f"navigation.leg[{i}]", table if isinstance(table, Mapping) else {}, _LEG)
+    for i, table in enumerate(tables_of(value), start=1):
+        numbers = _numbers(check, f"navigation.leg[{i}]", table, _LEG)
         if len(numbers) == len(_LEG):
             legs.append(Leg(**{**numbers, "turn_rate": float(np.deg2rad(numbers["turn_rate"]))}))
     return legs
@@ -157,7 +149,7 @@ def _initial(check: Checker, table: Mapping[str, Any]) -> InitialErrors | None:
     deviations = {}
     for key, bounds in _INITIAL.items():
         vector = check.vector(f"navigation.initial.{key}", table.get(key), 3)
-        if vector is not None and not _within(vector, bounds):
+        if vector is not None and not _within(bounds, vector):
             check.note(f"navigation.initial.{key}", f"three standard deviations, each {bounds}", shown(table[key]))
         elif vector is not None:
             deviations[key] = vector[:, 0]

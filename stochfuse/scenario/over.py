@@ -168,11 +168,8 @@ class Over:
             return None
         if not noises.common and not _simple(first):
             return None
-        return Items(rows, noises.take(np.repeat(np.arange(len(self.scenarios)), _each(rows, self.scenarios))))
-
-
-def _each(rows: LinkRows, scenarios: Sequence[Scenario]) -> int:
-    return len(rows.link) // len(scenarios)
+        points = len(self.scenarios)
+        return Items(rows, noises.take(np.repeat(np.arange(points), len(rows.link) // points)))
 
 
 def _label(names: Sequence[str], values: Sequence[float]) -> str:

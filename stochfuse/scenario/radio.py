@@ -105,7 +105,8 @@ def read_radio(check: Checker, table: Any) -> Radio | None:
     for key in Radio._fields:
         value = table.get(key, Radio._field_defaults.get(key))
         if key != "fading" and not (key == "shadowing" and key not in table):
-            numbers[key] = _number(check, f"network.radio.{key}", value, positive=key in _POSITIVE)
+            expected, fits = ("a number above 0", _positive) if key in _POSITIVE else ("a number", np.isfinite)
+            numbers[key] = check.number(f"network.radio.{key}", value, expected, fits)
     fading = check.choice("network.radio.fading", table.get("fading", "none"), FADINGS)
     if fading == "shadowing" and "shadowing" not in table:
         expected = 'a standard deviation in dB, since fading = "shadowing"'
@@ -120,22 +121,18 @@ def read_radio(check: Checker, table: Any) -> Radio | None:
 _POSITIVE = ("exponent", "reference_distance", "shadowing")
 
 
-def _number(check: Checker, path: str, value: Any, *, positive: bool) -> float | None:
-    expected = "a number above 0" if positive else "a number"
-    array = check.array(path, value, expected)
-    if array is None:  # what is missing the structure of the file has told
-        return None
-    if array.ndim or (positive and array <= 0):
-        check.note(path, expected, shown(value))
-        return None
-    return float(array)
+def _positive(number: Any) -> Any:
+    return number > 0
 
 
-def read_places(check: Checker, tables: Sequence[Any] | None, agents: int, steps: int, *, needed: bool) -> tuple:
+def read_places(
+    check: Checker, nodes: Sequence[Mapping[str, Any]], agents: int, steps: int, *, needed: bool
+) -> tuple[np.ndarray, ...]:
     """Read the agents' places from [[agent]].
 
     Parameters
     ----------
+    nodes : the [[agent]] tables.
     needed : whether links are worked out from them, so that none may be missing.
 
     Returns
@@ -144,7 +141,6 @@ def read_places(check: Checker, tables: Sequence[Any] | None, agents: int, steps
         Of every agent (D,) or (steps, D); empty where not all have one, or something is wrong, which the checker has
         noted.
     """
-    nodes = [table if isinstance(table, Mapping) else {} for table in tables or ()]
     if needed and not nodes:
         expected = f"one [[agent]] table with a position for each of the {agents} agents, since network.radio is given"
         check.note("agent", expected, "nothing")
@@ -161,9 +157,8 @@ def read_places(check: Checker, tables: Sequence[Any] | None, agents: int, steps
         if coordinates not in (1, 2, 3):
             check.note(path, "1 to 3 coordinates in m, or one such list per step", shown(value))
             return ()
-        place = check.vector(path, value, coordinates, steps)
-        if place is not None:
-            places.append(place[:steps, :, 0] if place.ndim == 3 else place[:, 0])
+        place = check.place(path, value, coordinates, steps)
+        places += [] if place is None else [place]
     return tuple(places) if len(places) == agents else ()
 
 

@@ -19,7 +19,7 @@ import copy
 import json
 import sys
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, wraps
 from numbers import Real
@@ -32,7 +32,7 @@ from stochfuse.errors import Problem, ScenarioError, UsageError, nearest
 from stochfuse.fusion.cooperative import Relation
 from stochfuse.kalman.checks import shown
 from stochfuse.kalman.metrics import metric as metric_of
-from stochfuse.scenario.checker import Checker
+from stochfuse.scenario.checker import Checker, table_of, tables_of
 from stochfuse.scenario.model import Filter, Model, NoiseCorrelation, Sensor
 from stochfuse.scenario.network import LinkRows, Network, default_rows, restricted, stacked_rows, uniform_rows
 from stochfuse.scenario.registry import ESTIMATORS, GENERAL, METHODS, MONTE_CARLO
@@ -147,14 +147,9 @@ class Scenario:
         return {"schema": SCHEMA, **copy.deepcopy(dict(self.source))}
 
 
-def one_state(scenario: Scenario) -> bool:
-    """Whether all agents track the state of one model."""
-    return not scenario.own and not scenario.filters
-
-
 def require_one_state(scenario: Scenario, who: str) -> None:
     """Raise UsageError unless all agents track the state of one model."""
-    if not one_state(scenario):
+    if not scenario.system.one_state:
         what = "states of their own (model.own)" if scenario.own else "filters of their own"
         raise UsageError(f"{who}: expected agents that track one state by one model, got agents with {what}")
 
@@ -452,10 +447,8 @@ def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> S
     if not isinstance(mapping, Mapping):
         raise ScenarioError(name, structure)
     check = Checker(skip={problem.path for problem in structure})
-    names = ("model", "initial", "network", "noise", "report")
-    tables = {key: mapping[key] if isinstance(mapping.get(key), dict) else {} for key in names}
-    agents, initial = mapping.get("agent"), tables["initial"]
-    agents = agents if isinstance(agents, list) else None
+    tables = {key: table_of(mapping, key) for key in ("model", "initial", "network", "noise", "report")}
+    agents, initial = tables_of(mapping.get("agent")), tables["initial"]
     network = read_network(check, tables["network"], agents)
     own = tables["model"].get("own") is True
     if isinstance(mapping.get("navigation"), dict):
@@ -465,7 +458,7 @@ def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> S
         P0 = check.covariance("initial.P", initial.get("P"), model.dimension if model else None, 0)
     d = model.dimension if model else None
     filters = read_filters(check, agents, model, P0, own, network)
-    named = read_named(check, mapping, model, network, own)
+    named = read_named(check, tables["model"], agents, model, network, own)
     sensors, sensor_of = read_sensors(check, agents, default, d, filters, network, named.sensors)
     correlation = check.choice("initial.correlation", initial.get("correlation", "independent"), CORRELATIONS)
     if correlation == "shared" and (own or filters):
@@ -475,7 +468,7 @@ def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> S
     noise, process = None, None
     if network is not None and len(sensor_of) == network.agents:
         noise, process = read_noise(check, tables["noise"], [sensors[s] for s in sensor_of], filters, own)
-    relations = _relations(check, mapping, model, network, own)
+    relations = _relations(check, mapping, agents, model, network, own)
     shown = _report(check, tables["report"], model, network)
     problems = [*structure, *check.problems]
     if problems:
@@ -498,7 +491,7 @@ def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> S
         noise=noise,
         process=process,
         relations=relations,
-        instruments=named.instruments(network.agents, agents is None),
+        instruments=named.instruments(network.agents, mapping.get("agent") is None),
         nominal=named.nominal,
         **shown,
     )
@@ -541,11 +534,14 @@ def _navigation(
 
 
 def _relations(
-    check: Checker, mapping: Mapping[str, Any], model: Model | None, network: Network | None, own: bool
+    check: Checker,
+    mapping: Mapping[str, Any],
+    tables: Sequence[Mapping[str, Any]],
+    model: Model | None,
+    network: Network | None,
+    own: bool,
 ) -> Mapping[tuple[int, int], Relation]:
     """What agents measure of each other."""
-    agents = mapping.get("agent")
-    tables = [table for table in agents if isinstance(table, dict)] if isinstance(agents, list) else []
     if "cooperative" not in mapping and not (
         own and not by_name(mapping) and any("position" in table for table in tables)
     ):
@@ -559,4 +555,4 @@ def _relations(
     if not own:
         check.note("model.own", "true, since agents measure each other's own places", "false")
     found = read_cooperative(check, mapping.get("cooperative"), tables, model.states, network.agents, network.steps)
-    return {} if found is None else found.pairs
+    return found or {}

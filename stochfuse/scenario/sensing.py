@@ -33,7 +33,7 @@ import numpy as np
 
 from stochfuse.fusion.cooperative import COINCIDENT, over_states
 from stochfuse.kalman.checks import LARGEST, shown
-from stochfuse.scenario.checker import Checker
+from stochfuse.scenario.checker import Checker, table_of
 from stochfuse.scenario.model import Model, Sensor, over_steps
 from stochfuse.scenario.motion import PLACES, Course, Layout, layout_of, rates, read_course
 from stochfuse.scenario.network import Network
@@ -393,18 +393,21 @@ class _Read(NamedTuple):
 
 
 def read_named(
-    check: Checker, mapping: Mapping[str, Any], model: Model | None, network: Network | None, own: bool
+    check: Checker,
+    table: Mapping[str, Any],
+    tables: Sequence[Mapping[str, Any]],
+    model: Model | None,
+    network: Network | None,
+    own: bool,
 ) -> Named:
     """Read model.sensor, model.nominal, [[agent]] sensor and position: the sensors by name.
 
     Parameters
     ----------
-    mapping : the whole scenario.
+    table, tables : [model], and the [[agent]] tables.
     own : whether every agent has a state of its own.
     """
-    table, agents = _table(mapping, "model"), mapping.get("agent")
-    common = _table(table, "sensor") if is_named(table.get("sensor")) else {}
-    tables = [t if isinstance(t, Mapping) else {} for t in agents] if isinstance(agents, list) else []
+    common = table_of(table, "sensor") if is_named(table.get("sensor")) else {}
     named = [i for i, agent in enumerate(tables) if is_named(agent.get("sensor"))]
     if model is None or network is None or not (common or named or table.get("nominal")):
         return Named(dict.fromkeys(named))
@@ -416,7 +419,7 @@ def read_named(
     given = _SensingContext(layout, course, model, steps, table.get("nominal") is not None, own)
     default = None
     if common:
-        _refuse(check, "model", table, ("H", "R"), "nothing beside a sensor by name")
+        check.absent("model", table, ("H", "R"), "nothing beside a sensor by name")
         default = _read(check, "model.sensor", common, given)
     if common and not tables:
         return Named({0: None if default is None else _placed(check, "agent", None, default, given)}, given.path)
@@ -424,30 +427,19 @@ def read_named(
     for i, agent in enumerate(tables):
         path = f"agent[{i + 1}]"
         if i in named:
-            _refuse(check, path, agent, ("H", "R"), "nothing beside a sensor by name")
+            check.absent(path, agent, ("H", "R"), "nothing beside a sensor by name")
             sensor = _read(check, f"{path}.sensor", agent["sensor"], given)
         elif common and agent.get("sensor") is not False and not {"H", "R"} & set(agent):
             sensor = default
         else:
             _place(check, path, agent.get("position"), given)
             continue
-        _refuse(check, path, agent, ("F", "M", "s"), MODEL_STATES)
+        check.absent(path, agent, ("F", "M", "s"), MODEL_STATES)
         found[i] = None if sensor is None else _placed(check, path, agent.get("position"), sensor, given)
     return Named(found, given.path)
 
 
-def _table(mapping: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    inner = mapping.get(key)
-    return inner if isinstance(inner, Mapping) else {}
-
-
 MODEL_STATES = "nothing beside a sensor by name, which measures the model's states; or H and R instead of it"
-
-
-def _refuse(check: Checker, path: str, table: Mapping[str, Any], keys: Sequence[str], expected: str) -> None:
-    for key in keys:
-        if table.get(key) is not None:
-            check.note(f"{path}.{key}", expected, shown(table[key]))
 
 
 def _read(check: Checker, path: str, table: Mapping[str, Any], given: _SensingContext) -> _Read | None:
@@ -530,13 +522,8 @@ def _due(check: Checker, path: str, table: Mapping[str, Any], steps: int) -> np.
 
 def _above_zero(check: Checker, path: str, value: Any, expected: str, most: float) -> float:
     """A number above 0; infinite where none is given."""
-    number = check.array(path, value, expected)
-    if number is None:
-        return np.inf
-    if number.ndim or not 0 < number <= most:
-        check.note(path, expected, shown(value))
-        return np.inf
-    return float(number)
+    number = check.number(path, value, expected, lambda number: 0 < number <= most)
+    return np.inf if number is None else number
 
 
 def _heading(check: Checker, path: str, table: Mapping[str, Any], steps: int) -> np.ndarray | None:
@@ -563,10 +550,8 @@ def _place(check: Checker, path: str, value: Any, given: _SensingContext) -> np.
     if given.layout is None or given.own:
         return None
     axes = given.layout.axes
-    place = check.vector(f"{path}.position", value, axes, given.steps)
-    if place is None:
-        return None
-    return place[: given.steps, :, 0] if place.ndim == 3 else np.broadcast_to(place[:, 0], (given.steps, axes))
+    place = check.place(f"{path}.position", value, axes, given.steps)
+    return None if place is None else np.broadcast_to(place, (given.steps, axes))
 
 
 def _placed(

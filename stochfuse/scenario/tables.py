@@ -1,6 +1,7 @@
-"""The tables of a scenario file, read and checked: what fits together becomes a model, sensors and a network.
+"""[model], [network], [[agent]] and [noise] of a scenario file, read and checked.
 
-The [noise] table of a scenario file: noises that hang together and are otherwise taken for independent.
+What fits together becomes a model, a network, sensors, filters of agents' own, and noises that hang together.  Models
+and sensors by name, [network.radio] and [cooperative] are read in files of their own.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 from stochfuse.kalman.checks import shown
 from stochfuse.scenario.checker import Checker
 from stochfuse.scenario.model import Filter, Model, NoiseCorrelation, Sensor
-from stochfuse.scenario.motion import read_motion, read_step, refuse_keys_of_kinds
+from stochfuse.scenario.motion import KEYS, read_motion, read_step
 from stochfuse.scenario.network import ARCHITECTURES, Network, mean_delivery, possible_senders
 from stochfuse.scenario.radio import links_between, read_places, read_radio
 from stochfuse.scenario.sensing import sometimes
@@ -22,7 +23,11 @@ MOST_DELAY = 10_000
 """Largest delay of a message, in steps."""
 
 
-def read_network(check: Checker, table: Mapping[str, Any], agent_tables: Sequence[Any] | None = None) -> Network | None:
+Tables = Sequence[Mapping[str, Any]]
+"""The [[agent]] tables; none where there are none."""
+
+
+def read_network(check: Checker, table: Mapping[str, Any], agent_tables: Tables = ()) -> Network | None:
     """Read [network], names and places from [[agent]]; None where something essential is wrong, which is noted."""
     agents = check.integer("network.agents", table.get("agents"), 1)
     steps = check.integer("network.steps", table.get("steps"), 1)
@@ -87,7 +92,7 @@ def _cases(
     bursts: list[np.ndarray | None] = []
     given = table.get("case")
     for i, case in enumerate(given if isinstance(given, list) else [], start=1):
-        if not isinstance(case, dict):
+        if not isinstance(case, Mapping):
             continue
         path = f"network.case[{i}]"
         own, bursty = link, burst
@@ -117,11 +122,7 @@ def _scale(check: Checker, table: Mapping[str, Any]) -> float | None:
     if all(table.get(key) is None for key in ("link", "radio", "sent", "burst", "case")):
         check.note("network.scale", "link probabilities in the scenario that it scales", "none")
     expected = "a finite number of at least 0"
-    array = check.array("network.scale", given, expected)
-    if array is not None and (array.ndim or array < 0):
-        check.note("network.scale", expected, shown(given))
-        return None
-    return None if array is None else float(array)
+    return check.number("network.scale", given, expected, lambda scale: scale >= 0)
 
 
 def _scaled(link: np.ndarray | None, scale: float | None) -> np.ndarray | None:
@@ -168,10 +169,9 @@ def _ratios(check: Checker, sent: np.ndarray, received: np.ndarray, hears: np.nd
     return np.divide(received, sent, out=np.zeros_like(sent), where=sent > 0).tolist()
 
 
-def _agent_names(check: Checker, nodes: Any, tables: Sequence[Any] | None, agents: int) -> tuple[str, ...]:
+def _agent_names(check: Checker, nodes: Any, tables: Tables, agents: int) -> tuple[str, ...]:
     """Names of the agents from network.nodes and [[agent]], which must not differ; empty where there are none."""
-    given = enumerate((table.get("name") if isinstance(table, dict) else None for table in tables or ()), start=1)
-    own = {i: name for i, name in given if isinstance(name, str)}
+    own = {i: table["name"] for i, table in enumerate(tables, start=1) if isinstance(table.get("name"), str)}
     if not isinstance(nodes, list):
         named = [(f"agent[{i}].name", own.get(i, str(i))) for i in range(1, agents + 1)] if own else []
     elif len(nodes) != agents:
@@ -224,11 +224,8 @@ def _burst(check: Checker, path: str, table: Mapping[str, Any]) -> np.ndarray | 
         if value is None:
             check.note(f"{path}.{key}", "a probability", "nothing")
             continue
-        number = check.array(f"{path}.{key}", value, "a probability")
-        if number is not None and (number.ndim or not 0 <= number <= 1):
-            check.note(f"{path}.{key}", "a probability", shown(value))
-        elif number is not None:
-            values.append(float(number))
+        number = check.number(f"{path}.{key}", value, "a probability", lambda p: 0 <= p <= 1)
+        values += [] if number is None else [number]
     if len(values) < len(keys):
         return None
     if values[0] + values[1] == 0:
@@ -336,7 +333,7 @@ def read_model(check: Checker, table: Mapping[str, Any], steps: int) -> tuple[Mo
 
 def _matrices(check: Checker, table: Mapping[str, Any], steps: int) -> tuple[np.ndarray | None, np.ndarray | None]:
     """F, and Q as it enters the state, of a model that is written out."""
-    refuse_keys_of_kinds(check, table)
+    check.absent("model", table, KEYS, "nothing without model.kind")
     read_step(check, table, steps)
     F = check.matrix("model.F", table.get("F"), None, None, steps)
     if F is not None and F.shape[-1] != F.shape[-2]:
@@ -384,7 +381,7 @@ def _sensor(
 
 def read_sensors(
     check: Checker,
-    agents: Any,
+    agents: Tables,
     default: Sensor | None,
     d: int | None,
     filters: Sequence[Filter],
@@ -408,14 +405,13 @@ def read_sensors(
     different: dict[tuple[Any, ...], int] = {}
     sensors, sensor_of = [], []
     for i, table in enumerate(agents, start=1):
-        path, table = f"agent[{i}]", table if isinstance(table, dict) else {}
+        path = f"agent[{i}]"
         size = filters[i - 1].dimension if filters else d
         if i - 1 in named:
             sensor = named[i - 1]
         elif table.get("sensor") is False:
             sensor = Sensor(np.zeros((0, size or 1)), np.zeros((0, 0)))
-            for key in {"H", "R"} & set(table):
-                check.note(f"{path}.{key}", "nothing, since sensor = false", shown(table[key]))
+            check.absent(path, table, ("H", "R"), "nothing, since sensor = false")
         else:
             # the model's sensor is for filters that have as many states as the model
             fitting = default if default is None or default.H.shape[-1] == size else None
@@ -435,10 +431,9 @@ def read_sensors(
 
 
 def read_filters(
-    check: Checker, agents: Any, model: Model | None, P0: np.ndarray | None, own: bool, network: Network | None
+    check: Checker, tables: Tables, model: Model | None, P0: np.ndarray | None, own: bool, network: Network | None
 ) -> tuple[Filter, ...]:
     """Read the agents' own filters from [[agent]]; none where all have the model's."""
-    tables = [table if isinstance(table, dict) else {} for table in agents or []]
     keys = ("F", "Q", "P") if own else ("F", "Q", "P", "M", "s")
     if model is None or P0 is None or network is None:
         return ()

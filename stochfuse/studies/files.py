@@ -1,6 +1,6 @@
-"""The finished file of a study, read in blocks of points.
+"""The answers of a study as a file, written part by part and read in blocks of points.
 
-The answers of a study as a file: one row per point and step, with every key and every quantity.
+One row per point and step, with every key and every quantity:
 
     point     number of the point, from 0
     …         the varied keys, by their names; matrices and the like as JSON
@@ -18,7 +18,8 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -178,6 +179,10 @@ def check_format(path: Path) -> None:
             raise UsageError(NO_PARQUET) from None
 
 
+PlanRows = dict[str, tuple[np.ndarray, Any]]
+"""Columns of some rows: values and None, or of words the codes and the words that they stand for."""
+
+
 class PlanColumns:
     """The columns of a plan's file, chunk by chunk."""
 
@@ -187,12 +192,12 @@ class PlanColumns:
         self.kinds = [name for name in ("method", "estimator", "nature") if name not in keys]
         self.names = ("point", *keys, *self.kinds, "step", *plan.columns, "error")
 
-    def of(self, points: range, answers: Answers) -> dict[str, tuple[np.ndarray, Any]]:
-        """Columns of some points: values, and of words the codes and the words that they stand for."""
+    def of(self, points: range, answers: Answers) -> PlanRows:
+        """Columns of some points."""
         rows = answers.rows
         first = np.concatenate([[0], np.cumsum(rows)])[:-1]
         failed = np.repeat(answers.steps == 0, rows)
-        found: dict[str, tuple[np.ndarray, Any]] = {"point": (np.repeat(np.array(points), rows), None)}
+        found: PlanRows = {"point": (np.repeat(np.array(points), rows), None)}
         for axis, codes in zip(self.plan.axes, self.plan.codes(points).values(), strict=True):
             words = axis.column if axis.kind == "text" else None
             found[axis.name] = (np.repeat(codes if words is not None else axis.shown(codes), rows), words)
@@ -225,83 +230,51 @@ def write_result(plan: Plan, answers: Iterator[tuple[range, Answers]], path: Pat
     """
     columns, rows, failed = PlanColumns(plan), 0, 0
     first: list[tuple[int, str]] = []
-    with (_Parquet if path.suffix.lower() == ".parquet" else _Csv)(path, columns) as file:
+    with (_parquet_file if path.suffix.lower() == ".parquet" else _csv_file)(path, columns) as write:
         for points, found in answers:
-            file.write(columns.of(points, found))
+            write(columns.of(points, found))
             rows, failed = rows + int(found.rows.sum()), failed + len(found.errors)
             first += list(found.errors.items())[: FIRST_ERRORS - len(first)]
     return {"points": plan.size, "rows": rows, "failed": failed, "first_errors": first}
 
 
-class _Parquet:
-    """A Parquet file that is being written."""
+@contextmanager
+def _parquet_file(path: Path, columns: PlanColumns) -> Iterator[Callable[[PlanRows], None]]:
+    """A Parquet file, to which one row group after the other is written."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
-    def __init__(self, path: Path, columns: PlanColumns) -> None:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        self.pa, plan = pa, columns.plan
-        words = pa.dictionary(pa.int32(), pa.string())
-        kinds = {"int": pa.int64(), "float": pa.float64(), "text": words}
-        types: dict[str, Any] = {"point": pa.int64(), "step": pa.int32(), "error": words}
-        types |= {axis.name: kinds[axis.kind] for axis in plan.axes}
-        types |= dict.fromkeys(columns.kinds, words) | dict.fromkeys(plan.columns, pa.float64())
-        fields = [pa.field(n, types[n], metadata=_label(plan.labels, n)) for n in columns.names]
-        about = {"stochfuse.study": json.dumps(plan.record)}
-        self.schema = pa.schema(fields, metadata=about)
-        text: Any = [name for name in columns.names if types[name] == words]
-        self.file = pq.ParquetWriter(path, self.schema, use_dictionary=text, compression="zstd")
-
-    def __enter__(self) -> _Parquet:
-        return self
-
-    def __exit__(self, *reason: Any) -> None:
-        self.file.close()
-
-    def write(self, columns: Mapping[str, tuple[np.ndarray, Any]]) -> None:
-        """Write one row group."""
-        self.file.write_table(self.pa.table(list(map(self._array, columns.values())), schema=self.schema))
-
-    def _array(self, column: tuple[np.ndarray, Any]) -> Any:
-        values, words = column
-        mask = np.ma.getmaskarray(values) if isinstance(values, np.ma.MaskedArray) else None
-        plain = np.ma.getdata(values)
-        if words is None:
-            kind = self.pa.int32() if mask is not None and plain.dtype.kind == "i" else None
-            return self.pa.array(plain, mask=mask, type=kind)
-        codes = self.pa.array(plain.astype(np.int32), mask=mask)
-        return self.pa.DictionaryArray.from_arrays(codes, self.pa.array(words, type=self.pa.string()))
+    plan, words = columns.plan, pa.dictionary(pa.int32(), pa.string())
+    kinds = {"int": pa.int64(), "float": pa.float64(), "text": words}
+    types: dict[str, Any] = {"point": pa.int64(), "step": pa.int32(), "error": words}
+    types |= {axis.name: kinds[axis.kind] for axis in plan.axes}
+    types |= dict.fromkeys(columns.kinds, words) | dict.fromkeys(plan.columns, pa.float64())
+    labels = {name: {"label": label} for name, label in plan.labels.items()}
+    fields = [pa.field(name, types[name], metadata=labels.get(name)) for name in columns.names]
+    schema = pa.schema(fields, metadata={"stochfuse.study": json.dumps(plan.record)})
+    text: Any = [name for name in columns.names if types[name] == words]
+    with pq.ParquetWriter(path, schema, use_dictionary=text, compression="zstd") as file:
+        yield lambda rows: file.write_table(pa.table([_arrow(pa, *column) for column in rows.values()], schema=schema))
 
 
-def _label(labels: Mapping[str, str], name: str) -> dict[str, str] | None:
-    return {"label": labels[name]} if name in labels else None
+def _arrow(pa: Any, values: np.ndarray, words: Any) -> Any:
+    mask = np.ma.getmaskarray(values) if isinstance(values, np.ma.MaskedArray) else None
+    plain = np.ma.getdata(values)
+    if words is None:
+        return pa.array(plain, mask=mask, type=pa.int32() if mask is not None and plain.dtype.kind == "i" else None)
+    codes = pa.array(plain.astype(np.int32), mask=mask)
+    return pa.DictionaryArray.from_arrays(codes, pa.array(words, type=pa.string()))
 
 
-class _Csv:
-    """A CSV file that is being written."""
-
-    def __init__(self, path: Path, columns: PlanColumns) -> None:
-        self.path, self.names = path, columns.names
-
-    def __enter__(self) -> _Csv:
-        self.file = self.path.open("w", newline="", encoding="utf-8")
-        self.writer = csv.writer(self.file, lineterminator="\n")
-        try:
-            self.writer.writerow(self.names)
-        except BaseException:
-            self.file.close()
-            raise
-        return self
-
-    def __exit__(self, *reason: Any) -> None:
-        self.file.close()
-
-    def write(self, columns: Mapping[str, tuple[np.ndarray, Any]]) -> None:
-        """Write rows."""
-        self.writer.writerows(zip(*map(_cells, columns.values()), strict=True))
+@contextmanager
+def _csv_file(path: Path, columns: PlanColumns) -> Iterator[Callable[[PlanRows], None]]:
+    """A CSV file, to which rows are written."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns.names)
+        yield lambda rows: writer.writerows(zip(*(_cells(*column) for column in rows.values()), strict=True))
 
 
-def _cells(column: tuple[np.ndarray, Any]) -> list[Any]:
-    values, words = column
+def _cells(values: np.ndarray, words: Any) -> list[Any]:
     cells = values.tolist()  # None where masked
     return cells if words is None else [None if cell is None else words[cell] for cell in cells]

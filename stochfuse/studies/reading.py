@@ -1,4 +1,4 @@
-"""The structure of a study file, for pydantic.
+"""A study file, read and checked: what fits together becomes a plan.
 
     schema = "stochfuse.study/1"
     scenario = "cv-2d"                                    # a preset, a file, or a [scenario] table
@@ -13,13 +13,8 @@
     [report]                                              # what is tabulated
     quantity = ["claimed", "messages"]
 
-Whether the values fit the scenario is found out point by point, see `stochfuse.studies.evaluation`.
-
-What a study varies: listed values of a key, or a range of a Latin hypercube.
-
-A study file, read and checked: what fits together becomes a plan.
-
-Whether the values of a key fit the scenario is found out point by point; here, whether there is such a key.
+Its structure is declared in `stochfuse.studies.plan`.  Whether the values of a key fit the scenario is found out point
+by point (`stochfuse.studies.evaluation`); here, whether there is such a key.
 """
 
 from __future__ import annotations

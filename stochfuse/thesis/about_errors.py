@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from stochfuse.kalman.kernel import Estimate, predict, update
-from stochfuse.thesis.bench import ARCHITECTURES, TRANSIENT, Bench, Sweep, ThesisCase, noise_order
+from stochfuse.thesis.bench import ARCHITECTURES, LIKE_NETWORKS, TRANSIENT, Bench, Sweep, ThesisCase, noise_order
 from stochfuse.thesis.figures import RATIOS, change, percent
 from stochfuse.thesis.statements import Stated, Verdict, explained, judged, listed
 
 STATED = Stated()
 FINE = (0.0, 0.125, 0.25, 0.375, 0.5)
 EIGHTHS = tuple(i / 8 for i in range(9))
-TWO = ("ad-hoc", "broadcast")
 CAUSE = "without the common initial error it falls steadily"
 INITIAL_ERROR = "the statement holds, and RMS error falls steadily without the common initial error"
 
@@ -48,7 +47,7 @@ def filtered(sweep: Sweep, everyone: int, drawn: np.ndarray) -> np.ndarray:
     {26: TRANSIENT},
     "At 0 % and 100 % the state estimates are those of the known algorithms.",
     "equal to the Kalman filter on one agent's, on everyone's data",
-    TWO,
+    LIKE_NETWORKS,
 )
 def _known_estimates(sweep: Sweep) -> Verdict:
     drawn, n = sweep.records(5), sweep.scenario.network.agents
@@ -59,7 +58,7 @@ def _known_estimates(sweep: Sweep) -> Verdict:
     return judged(away < 1e-6, f"largest difference over 5 records {away:.0e}")
 
 
-@STATED.of({26: TRANSIENT}, "At some steps the estimate is better at 0 % than at 25 %.", INITIAL_ERROR, TWO)
+@STATED.of({26: TRANSIENT}, "At some steps the estimate is better at 0 % than at 25 %.", INITIAL_ERROR, LIKE_NETWORKS)
 def _worse_at_some_step(sweep: Sweep) -> Verdict:
     bias = np.abs(sweep.bias)
     ours = f"mean error at 0 % {listed(bias[0])}; at 25 % {listed(bias[1])} (k=1–{sweep.bench.steps})"
@@ -115,7 +114,7 @@ def _rises(sweep: Sweep) -> Verdict:
 
 @STATED.about([32], "It is greatest at 25 % in ad hoc and broadcast networks.", INITIAL_ERROR)
 def _greatest_at_25(bench: Bench) -> Verdict:
-    sweeps = [transient(bench, a) for a in TWO]
+    sweeps = [transient(bench, a) for a in LIKE_NETWORKS]
     ad_hoc, broadcast = (change(sweep.averaged()) for sweep in sweeps)
     ours = f"change against 0 %: ad hoc {listed(ad_hoc, 3)}; broadcast {listed(broadcast, 3)} (per cent)"
     seen = ad_hoc.argmax() == broadcast.argmax() == 1
@@ -124,7 +123,7 @@ def _greatest_at_25(bench: Bench) -> Verdict:
 
 @STATED.about([32], "Ad hoc and broadcast networks show nearly the same.", "within 2 %")
 def _identical(bench: Bench) -> Verdict:
-    ad_hoc, broadcast = (transient(bench, a).averaged() for a in TWO)
+    ad_hoc, broadcast = (transient(bench, a).averaged() for a in LIKE_NETWORKS)
     away = 100 * np.abs(ad_hoc / broadcast - 1).max()
     return judged(away < 2, f"they differ by at most {away:.2g} %")
 
@@ -159,7 +158,7 @@ def _faster_and_faster(sweep: Sweep) -> Verdict:
     {33: TRANSIENT},
     "The peak is at or near 12.5 % ({network}).",
     f"largest of five levels there: {INITIAL_ERROR}",
-    TWO,
+    LIKE_NETWORKS,
     next_figure=0,
     at=0.125,
 )

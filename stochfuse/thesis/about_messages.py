@@ -7,13 +7,22 @@ from collections.abc import Mapping
 import numpy as np
 
 from stochfuse.scenario.registry import NAIVE
-from stochfuse.thesis.bench import ARCHITECTURES, LINKS, STATED_WINDOW, TABLE_3, TRANSIENT, WINDOW, Bench, Sweep
+from stochfuse.thesis.bench import (
+    ARCHITECTURES,
+    LIKE_NETWORKS,
+    LINKS,
+    STATED_WINDOW,
+    TABLE_3,
+    TRANSIENT,
+    WINDOW,
+    Bench,
+    Sweep,
+)
 from stochfuse.thesis.statements import Stated, Verdict, explained, judged, listed
 
 STATED = Stated()
 INNER = slice(1, 4)
 """The levels that are not 0 or 100 %."""
-LIKE_NETWORKS = ("ad-hoc", "broadcast")
 
 
 def _named(values: Mapping[str, str], between: str = "; ") -> str:

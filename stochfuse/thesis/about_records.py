@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 
 from stochfuse.scenario.registry import LFG, NAIVE, SIMPLIFIED
-from stochfuse.thesis.about_methods import BEST_OF_NAIVE, best_of_naive
+from stochfuse.thesis.about_methods import AD_HOC, BEST_OF_NAIVE, best_of_naive
 from stochfuse.thesis.bench import STEADY, Bench, Sweep, time_average
 from stochfuse.thesis.statements import Stated, Verdict, judged, listed
 
 STATED = Stated()
-AD_HOC = ("ad-hoc",)
 MANY = 2000
 """Records that shares are counted in."""
 READINGS = {"own": "own data", "start": "one start", "all": "one start and measurement"}

@@ -32,7 +32,6 @@ NO_RATIOS = (
     "difference but for the scale of the noise, as P(k0) = R"
 )
 SIZES = "Size: nodes of a step's messages that are new to the receiver"
-FINE = (0.0, 0.125, 0.25, 0.375, 0.5)
 
 
 @dataclass(frozen=True)
@@ -137,7 +136,7 @@ def _averaged_over_time() -> Iterator[Item]:
     quantity = show.averaged_errors
     yield _figure(32, f"{title}, transient", quantity, *networks, notes=ERRORS, options=no_error)
     up_to = f"{title}, transient, up to 50 %"
-    yield _figure(33, up_to, quantity, *networks, notes=ERRORS, links=FINE, options=no_error)
+    yield _figure(33, up_to, quantity, *networks, notes=ERRORS, links=about_errors.FINE, options=no_error)
     steady, options = f"{title}, steady state", {"variants": ("start", "all")}
     yield _figure(48, steady, quantity, *_networks(STEADY, LFG), notes=ERRORS, options=options)
     title, notes = (

@@ -9,10 +9,11 @@ import pytest
 
 import stochfuse as sf
 from stochfuse.data.causes import Cause, diagnose, independent_runs, summary
+from stochfuse.data.cells import Cell
 from stochfuse.data.crosscheck import check_results
 from stochfuse.data.mistakes import MISTAKES
 from stochfuse.data.results import read_results
-from stochfuse.data.supposed import CellMean, LinkMeans
+from stochfuse.data.supposed import LinkMeans
 from stochfuse.kalman.metrics import metric
 from stochfuse.scenario.scenario import link_rows
 from tests.cli.command import run as command
@@ -152,10 +153,10 @@ def test_a_cause_is_a_record():
 
 def test_the_door_takes_cells_of_ones_own():
     s = scenario(WALK)
-    prediction, rows, m = sf.predict(s, [0.5], "general"), link_rows(s, [0.5]), metric("trace", s.model)
+    prediction, rows = sf.predict(s, [0.5], "general"), link_rows(s, [0.5])
     expected = prediction.values("trace")[0]
     cells = tuple(
-        CellMean("claimed", m, k + 1, (1, 2), 1000, 2 * float(expected[k]), 0.01, float(expected[k])) for k in range(3)
+        Cell("0.5", 0, k + 1, (1, 2), 1000, 2 * float(expected[k]), 0.01, float(expected[k])) for k in range(3)
     )
     assert diagnose(prediction, rows, []) == ()
     first = diagnose(prediction, rows, [LinkMeans("0.5", 0, cells)])[0]

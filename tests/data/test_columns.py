@@ -6,14 +6,13 @@ import csv
 import io
 import json
 import sys
-import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from stochfuse.data import columns, tables
-from stochfuse.data.columns import LABEL, NUMBER, TEXT, WHOLE, ColumnField, ColumnsError, read_chunks, read_columns
+from stochfuse.data.columns import LABEL, NUMBER, TEXT, WHOLE, ColumnField, ColumnsError, read_columns
 from stochfuse.errors import StochfuseError
 
 FIELDS = (
@@ -133,7 +132,7 @@ def test_runs_may_have_names(tmp_path, parser):
 
 
 @pytest.mark.slow
-def test_chunks_are_the_whole_in_parts(tmp_path, parser, monkeypatch):
+def test_blocks_make_up_the_whole(tmp_path, parser, monkeypatch):
     """Blocks that end anywhere, with lines left out here and there."""
     rng = np.random.default_rng(1)
     z = rng.normal(size=500).round(3)
@@ -147,30 +146,11 @@ def test_chunks_are_the_whole_in_parts(tmp_path, parser, monkeypatch):
     whole = read_columns(path, FIELDS)
     for block in (1, 37, 1000):
         monkeypatch.setattr(tables, "BLOCK", block)
-        parts = list(read_chunks(path, FIELDS, rows=20))
-        assert max(part.length for part in parts) <= 20
-        assert [part.line(i) for part in parts for i in range(part.length)] == numbers
-        for name in ("run", "step", "z1"):
-            assert np.array_equal(np.concatenate([part.number[name] for part in parts]), whole.number[name])
-        agents = [part.text["agent"].names[code] for part in parts for code in part.text["agent"].codes]
-        assert agents == [f"a{i % 3}" for i in range(500)]
         joined = read_columns(path, FIELDS)
         assert plain(joined) == plain(whole)
         assert [joined.line(i) for i in range(500)] == numbers
     assert np.array_equal(whole.number["z1"], z)
-
-
-@pytest.mark.slow
-def test_memory_does_not_grow_with_the_file(tmp_path, parser, monkeypatch):
-    monkeypatch.setattr(tables, "BLOCK", 50_000)
-    peaks = []
-    for rows in (10_000, 100_000):
-        path = written(tmp_path, "step,z1\n" + "1,0.25\n" * rows)
-        tracemalloc.start()
-        assert sum(part.length for part in read_chunks(path, FIELDS[2:4])) == rows
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    assert peaks[1] < 1.5 * peaks[0]
+    assert plain(whole)["agent"] == [f"a{i % 3}" for i in range(500)]
 
 
 def test_renamed(tmp_path, parser):

@@ -602,14 +602,13 @@ def test_reading_spreads_every_pair_over_the_state():
     relations, problems = read({"positions": ["x", "y"], "range": 2, "direction": 0.1})
     assert not problems
     assert relations is not None
-    assert relations.positions == (0, 2)
-    assert sorted(relations.pairs) == [(0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)]
-    H_i, H_j, R = relations.pairs[0, 1]
+    assert sorted(relations) == [(0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)]
+    H_i, H_j, R = relations[0, 1]
     np.testing.assert_allclose(H_j, [[0.6, 0, 0.8], [-0.16, 0, 0.12]], atol=1e-15)
     np.testing.assert_array_equal(H_i, -H_j)
     np.testing.assert_allclose(R, np.diag([4, 0.01]))
-    assert relations.pairs[0, 2].H_i.shape == (2, 2, 3)
-    np.testing.assert_allclose(relations.pairs[2, 0].H_j[:, 1], [[1 / 5, 0, 0], [1 / 6, 0, 0]], atol=1e-15)
+    assert relations[0, 2].H_i.shape == (2, 2, 3)
+    np.testing.assert_allclose(relations[2, 0].H_j[:, 1], [[1 / 5, 0, 0], [1 / 6, 0, 0]], atol=1e-15)
 
 
 def test_a_pairs_own_table_takes_the_place_of_the_common_one():
@@ -620,9 +619,9 @@ def test_a_pairs_own_table_takes_the_place_of_the_common_one():
     relations, problems = read({"positions": ["x", "y"], "range": 2, "pair": pairs})
     assert not problems
     assert relations is not None
-    assert sorted(relations.pairs) == [(0, 1), (0, 2), (1, 0), (1, 2), (2, 1)]
-    np.testing.assert_array_equal(relations.pairs[0, 1].R, [[0.25]])
-    np.testing.assert_array_equal(relations.pairs[1, 0].R, [[4.0]])
+    assert sorted(relations) == [(0, 1), (0, 2), (1, 0), (1, 2), (2, 1)]
+    np.testing.assert_array_equal(relations[0, 1].R, [[0.25]])
+    np.testing.assert_array_equal(relations[1, 0].R, [[4.0]])
 
 
 def test_pairs_alone_are_enough_and_communicating_nodes_may_coincide():
@@ -631,7 +630,7 @@ def test_pairs_alone_are_enough_and_communicating_nodes_may_coincide():
     relations, problems = read(table, nodes)
     assert not problems
     assert relations is not None
-    assert sorted(relations.pairs) == [(0, 2), (2, 0)]
+    assert sorted(relations) == [(0, 2), (2, 0)]
 
 
 def test_without_a_table_there_is_nothing():
@@ -737,14 +736,14 @@ def test_reading_names_what_is_wrong_in_the_table(changes, problem):
 
 def test_clocks_and_linear_relations_need_no_places():
     relations, problems = read({"clock": "vx", "time": 0.5, "pair": [LINEAR]}, nodes=None)
-    assert (relations.positions, problems) == ((), [])
+    assert problems == []
     for pair, expected in (
         ((0, 1), ([[1, 0, 0]], [[0, 0, 2]], [[3]])),
         ((2, 1), ([[0, 1, 0]], [[0, -1, 0]], [[0.25]])),
     ):
-        for M, of in zip(relations.pairs[pair], expected, strict=True):
+        for M, of in zip(relations[pair], expected, strict=True):
             np.testing.assert_array_equal(M, of)
-    assert len(relations.pairs) == 6
+    assert len(relations) == 6
     assert read({**GOOD, "pair": [{"agents": [1, 2], "H_i": [[1, 0, 0]], "R": 1.0}]})[1] == [
         "cooperative.pair[1].H_j: expected a matrix beside the others of H_i, H_j and R, got nothing"
     ]
@@ -756,7 +755,7 @@ def test_small_angles_in_space_turn_what_is_seen():
     nodes = [{"position": [0, 0, 0]}, {"position": [3, 4, 12]}]
     relations, problems = read(table, nodes, 2, states=states)
     assert not problems
-    H_i, H_j, _ = relations.pairs[0, 1]
+    H_i, H_j, _ = relations[0, 1]
     # to turn about the line of sight is not seen; about anything else as far as the line of sight goes round
     np.testing.assert_allclose(H_i[:, 3:] @ [3, 4, 12], 0, atol=1e-12)
     assert np.linalg.norm(H_i[:, 3:] @ np.array([4, -3, 0]) / 5) == pytest.approx(1.0)
@@ -841,5 +840,4 @@ def test_the_presets_can_be_read(name, D, pairs):
     relations, problems = read(table, mapping["agent"], network["agents"], network["steps"], mapping["model"]["states"])
     assert not problems
     assert relations is not None
-    assert relations.positions == tuple(range(D))
-    assert len(relations.pairs) == pairs
+    assert len(relations) == pairs

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import random
+import sys
 from collections import defaultdict
 from itertools import pairwise
 from pathlib import Path
@@ -202,6 +203,25 @@ def test_frames_and_parquet_are_logs_too(tmp_path):
     frame.to_csv(tmp_path / "log.csv", index=False)
     for found in (sf.links(frame), sf.links(tmp_path / "log.parquet"), sf.links(tmp_path / "log.csv")):
         assert found.link[1, 0] == pytest.approx(2 / 3)
+
+
+def test_text_is_read_without_pyarrow_too(tmp_path, monkeypatch):
+    path = written(tmp_path, log_of([(k, s, r, int(k % 3 > 0)) for s in "abc" for r in "abc" if s != r for k in range(9)]))  # fmt: skip
+    matrix = written(tmp_path, "\ufeff,a,b\n\na,1,0.25\nb,0.5,1\n", "matrix.csv")
+    torn = written(tmp_path, "seq,sender,receiver,received\n1,a,b,1\n2,a,b\n", "torn.csv")
+    before = [read_links(each) for each in (path, matrix)]
+    for module in ("pyarrow", "pyarrow.csv", "pyarrow.parquet"):
+        monkeypatch.setitem(sys.modules, module, None)
+    for one, each in zip(before, (path, matrix), strict=True):
+        again = read_links(each)
+        assert (again.nodes, again.burst) == (one.nodes, one.burst)
+        np.testing.assert_array_equal(again.link, one.link)
+    with pytest.raises(UsageError, match=r"torn\.csv, line 3: expected 4 columns, got 3"):
+        read_links(torn)
+    with pytest.raises(
+        sf.StochfuseError, match=r"Parquet files of links need pyarrow: pip install 'stochfuse\[study\]'"
+    ):
+        read_links(tmp_path / "log.parquet")
 
 
 PACKETS = {"seq": [1, 2, 3, 1, 2], "sender": ["1", "1", "1", "NA", "NA"], "receiver": ["NA", "NA", "NA", "1", "1"], "received": [True, False, True, True, True]}  # fmt: skip
