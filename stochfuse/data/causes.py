@@ -14,7 +14,8 @@ samples, with slack for what is estimated); the others by how far the cells are 
 decides alone.  A mistake that explains no better than that nothing is wrong is none.  Where no single one explains,
 pairs of the nearest are tried.  An unknown number is found by parabolas through the cells' means.
 
-The first steps and some links are enough to tell mistakes apart, so that long files take no longer than short ones.
+Some links and the first steps, to the first that is far off, are mostly enough to tell mistakes apart; what explains
+these is tried on twice as many, as long as there are some and time is left.  A cause says which steps it was tried on.
 
 Wrong links: µ of each row is estimated, from the polynomials of the general formulation where the prediction has them.
 Dependent runs: the results would be right, with the number of runs that their own correlation leaves.
@@ -57,8 +58,10 @@ WORTH = 1e-9
 """p-value from which on a mistake is looked at closely."""
 NEAREST, PAIRED, LISTED = 6, 6, 8
 """Mistakes that are looked at closely, those tried in pairs, and causes named that do not explain."""
-LINKS, CELLS, STEPS = 4, 60, (8, 8, 4, 3)
-"""Links, cells of a link, and first steps, of 1, 2, 3 and more agents, that are looked at."""
+LINKS, CELLS, STEPS, LAST = 4, 60, (8, 8, 4, 3), 32
+"""Links, cells of a link, and first steps, of 1, 2, 3 and more agents, that are looked at; the last that ever is."""
+FAR = 5.0
+"""Standard errors by which a step is far off."""
 BETTER, SPREAD, CLOSE = 6.0, 40.0, 0.01
 """Least gain in T² over a right simulator, most by which the spread of the runs may be worse than another mistake's,
 and gain in T² that ends a search."""
@@ -81,6 +84,7 @@ class Cause(NamedTuple):
     estimate : the number that was estimated, or None.
     remaining : largest |z| over the cells that is left.
     of : the mistakes' names.
+    until, last : the last step that was looked at, and the last of the results.
     """
 
     cause: str
@@ -90,6 +94,13 @@ class Cause(NamedTuple):
     estimate: float | None
     remaining: float
     of: tuple[str, ...]
+    until: int = 0
+    last: int = 0
+
+    @property
+    def scope(self) -> str:
+        """In words, which steps were looked at where that is not all; else empty."""
+        return f" of steps up to {self.until} (of {self.last})" if self.until < self.last else ""
 
 
 class _ClosestMistake(NamedTuple):
@@ -140,22 +151,51 @@ def diagnose(
     UsageError
         If blocks name rows or agents that the prediction does not have.
     """
-    if not blocks or not any(block.cells for block in blocks):
-        return ()
-    return _Diagnosis(prediction, *_fewer(prediction, rows, blocks), alpha).causes()
+    blocks = [block for block in blocks if block.cells]
+    tried, found, until = MISTAKES, (), monotonic() + PATIENCE
+    for end in _ends(prediction, blocks):
+        diagnosis = _Diagnosis(prediction, *_fewer(prediction, rows, blocks, end), alpha)
+        causes = diagnosis.causes(tried, until)
+        if found and not any(cause.explains for cause in causes):  # of more steps, what else?
+            causes = diagnosis.causes(MISTAKES, until)
+        if found and monotonic() > until:
+            break
+        found = tuple(cause._replace(until=end, last=_last(blocks)) for cause in causes)
+        names = {name for cause in found if cause.explains for name in cause.of}
+        if not names:
+            break
+        tried = tuple(mistake for mistake in MISTAKES if mistake.name in names)
+    return found
+
+
+def _last(blocks: Sequence[LinkMeans]) -> int:
+    return max(cell.step for block in blocks for cell in block.cells)
+
+
+def _ends(prediction: Prediction, blocks: Sequence[LinkMeans]) -> Iterator[int]:
+    """Last steps to look at, one after another."""
+    if not blocks:
+        return
+    cells, last = [cell for block in blocks for cell in block.cells], _last(blocks)
+    first = max(_by_agents(STEPS, prediction), min(cell.step for cell in cells))
+    far = min((cell.step for cell in cells if abs(cell.z) > FAR and cell.step <= LAST), default=0)
+    end = min(last, max(first, far))
+    yield end
+    while end < min(last, LAST):
+        end = min(2 * end, last, LAST)
+        yield end
 
 
 def _by_agents(numbers: Sequence[int], prediction: Prediction) -> int:
     return numbers[min(len(prediction.group_of), len(numbers)) - 1]
 
 
-def _fewer(prediction: Prediction, rows: LinkRows, blocks: Sequence[LinkMeans]) -> tuple[LinkRows, System, Fits]:
-    """As many links, steps and cells as are enough."""
+def _fewer(
+    prediction: Prediction, rows: LinkRows, blocks: Sequence[LinkMeans], last: int
+) -> tuple[LinkRows, System, Fits]:
+    """As many links and cells as are enough, of steps up to the last."""
     most = LINKS if len(prediction.group_of) <= FEW else LINKS // 2
     blocks = [blocks[i] for i in np.unique(np.linspace(0, len(blocks) - 1, min(most, len(blocks))).astype(int))]
-    first = min(min(cell.step for cell in block.cells) for block in blocks)
-    last = max(first, _by_agents(STEPS, prediction))
-    last = min(last, max(cell.step for block in blocks for cell in block.cells))
     found = []
     for number, block in enumerate(blocks):
         here = [i for i, cell in enumerate(block.cells) if cell.step <= last]
@@ -183,8 +223,8 @@ def causes_of(verdict: Verdict, judged: Sequence[Judged], rows: LinkRows) -> tup
 
 
 def _blocks(judged: Sequence[Judged]) -> list[LinkMeans]:
-    """Cells of every link probability, of the first steps or the first one there is, with what each run has."""
-    last = max(STEPS[0], min((j.cell.step for j in judged), default=0))
+    """Cells of every link probability, of steps up to `LAST` or the first one there is, with what each run has."""
+    last = max(LAST, min((j.cell.step for j in judged), default=0))
     found = []
     for row in sorted({j.cell.row for j in judged}):
         mine = [j for j in judged if j.cell.row == row and j.cell.step <= last and np.isfinite(j.cell.mean)]
@@ -211,15 +251,15 @@ def summary(causes: Sequence[Cause]) -> str:
         first, others = explaining[0], [c.cause for c in explaining[1:]]
         so = f"; so {'does' if len(others) == 1 else 'do'} {', '.join(others)}" if others else ""
         if len(first.of) > 1:
-            return f"likely cause: two faults, {' and '.join(first.of)}, together explain the numbers{so}"
-        return f"likely cause: {first.cause} explains the numbers{so}"
+            return f"likely cause: two faults, {' and '.join(first.of)}, together explain the numbers{first.scope}{so}"
+        return f"likely cause: {first.cause} explains the numbers{first.scope}{so}"
     known = len(MISTAKES) + 2
     if not causes:
         return f"none of the {known} known mistakes can be tried on this scenario"
-    nearest = causes[0]
+    nearest, scope = causes[0], causes[0].scope
     return (
-        f"none of the {known} known mistakes explains the numbers; nearest {' and '.join(nearest.of)}, leaves |z| up "
-        f"to {nearest.remaining:.3g}"
+        f"none of the {known} known mistakes explains the numbers{scope}; nearest "
+        f"{' and '.join(nearest.of)}, leaves |z| up to {nearest.remaining:.3g}"
     )
 
 
@@ -231,12 +271,11 @@ class _Diagnosis:
     results: Fits
     alpha: float
 
-    def causes(self) -> tuple[Cause, ...]:
-        """All of it."""
-        until, runs = monotonic() + PATIENCE, _by_agents(ROUGHLY, self.prediction)
-        rough = _SimulatorTrials(self, runs)
+    def causes(self, mistakes: Sequence[Mistake], until: float) -> tuple[Cause, ...]:
+        """All of it, of some mistakes and those that are found otherwise, for as long as there is time."""
+        rough = _SimulatorTrials(self, _by_agents(ROUGHLY, self.prediction))
         nothing = self.results.judge(self.results.expected).distance
-        tried = self._singles(rough, until)
+        tried = self._singles(rough, mistakes, until)
         best = [*self._closer(tried, until), *self._others(rough)]
         if not any(self._explains(t) for t in best):
             best += self._closer(self._pairs(rough, tried, until), until)
@@ -258,12 +297,12 @@ class _Diagnosis:
         estimator = LFG if p.estimator == BROADCAST_PRIOR else p.estimator
         return Simulator(self.system, self.rows, estimator, followed=self.results.errors)
 
-    def _singles(self, trial: _SimulatorTrials, until: float) -> list[_ClosestMistake]:
+    def _singles(self, trial: _SimulatorTrials, mistakes: Sequence[Mistake], until: float) -> list[_ClosestMistake]:
         found = []
-        for number, mistake in enumerate(MISTAKES):
+        for number, mistake in enumerate(mistakes):
             if monotonic() > until:
                 break
-            listener().advance(f"trying {mistake.name}", number, len(MISTAKES))
+            listener().advance(f"trying {mistake.name}", number, len(mistakes))
             best = trial.best((mistake,), mistake.variants(self.base))
             found += [] if best is None else [best]
         return sorted(found, key=self._rank)

@@ -34,7 +34,7 @@ MOST_WEIGHED = 3
 """Agents up to which the weights of an intersection are worked out."""
 LONG = 0.8
 """Correlation of a link's states where it is what they deliver that is estimated."""
-FILTERS, CLAIMS = "in the filters alone", "in what is claimed alone"
+FILTERS, TRUTH, CLAIMS = "in the filters alone", "in the truth alone", "in what is claimed alone"
 
 
 class Variant(NamedTuple):
@@ -85,16 +85,20 @@ def _rows(s: Simulator, **changes: Any) -> Simulator:
     return replace(s, rows=replace(s.rows, **changes))
 
 
-def _systems(s: Simulator) -> Iterator[tuple[str, System, str]]:
-    """What a number may be wrong in, and which that is: the whole simulator, or what its filters alone are told."""
-    yield "system", s.system, ""
+def _changed(
+    s: Simulator, change: Callable[[System, float], System]
+) -> Iterator[tuple[str, Callable[[float], Simulator]]]:
+    """Where a number may be wrong, and the simulator: everywhere, in what its filters are told, or in what is true."""
+    yield "", lambda at: replace(s, system=change(s.system, at))
     if s.followed and s.estimator in SUMS:
-        yield "told", s.told or s.system, FILTERS
+        told = s.told or s.system
+        yield FILTERS, lambda at: replace(s, told=change(told, at))
+        yield TRUTH, lambda at: replace(s, system=change(s.system, at), told=told)
 
 
-def _changed(s: Simulator, make: Callable[[System], System]) -> Iterator[Variant]:
-    for where, system, note in _systems(s):
-        yield _certain(replace(s, **{where: make(system)}), note)
+def _certainly_changed(s: Simulator, change: Callable[[System], System]) -> Iterator[Variant]:
+    for note, of in _changed(s, lambda system, _: change(system)):
+        yield Variant(of, note=note)
 
 
 def scaled(system: System, *, Q: float = 1.0, R: float = 1.0, P0: float = 1.0) -> System:
@@ -114,11 +118,7 @@ def scaled(system: System, *, Q: float = 1.0, R: float = 1.0, P0: float = 1.0) -
 
 
 def _scaled(s: Simulator, which: str) -> Iterator[Variant]:
-    for where, system, note in _systems(s):
-
-        def of(log: float, where: str = where, system: System = system) -> Simulator:
-            return replace(s, **{where: scaled(system, **{which: float(np.exp(log))})})
-
+    for note, of in _changed(s, lambda system, log: scaled(system, **{which: float(np.exp(log))})):
         yield Variant(of, SCALES, np.exp, note)
 
 
@@ -415,12 +415,12 @@ def _metric(s: Simulator) -> Iterator[Variant]:
 def _transposed(s: Simulator) -> Iterator[Variant]:
     F = s.system.model.F
     if s.system.one_state and (np.swapaxes(F, -1, -2) != F).any():
-        yield from _changed(s, lambda x: replace(x, model=replace(x.model, F=np.swapaxes(x.model.F, -1, -2))))
+        yield from _certainly_changed(s, lambda x: replace(x, model=replace(x.model, F=np.swapaxes(x.model.F, -1, -2))))
 
 
 def _no_noise(s: Simulator) -> Iterator[Variant]:
     if s.system.one_state and s.system.model.Q.any():
-        yield from _changed(s, lambda system: scaled(system, Q=0.0))
+        yield from _certainly_changed(s, lambda system: scaled(system, Q=0.0))
 
 
 def _other_error(s: Simulator, of: Callable[[np.ndarray], np.ndarray | None]) -> Iterator[Variant]:

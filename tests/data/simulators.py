@@ -23,11 +23,12 @@ SCENARIO = {
 """The same as a file of the package has it."""
 
 
-def naive(µ, runs, rng, agents=2, error=(0.0, 0.0)):
+def naive(µ, runs, rng, agents=2, error=(0.0, 0.0), noise=1.0):
     """Kalman filters that take what they hear for independent: claimed covariances and errors of every step.
 
     In the first step nothing is measured.  Every message is heard with probability µ, and all that is heard in a step
-    is fused by inverse covariances; the fused estimate is the next step's prior.
+    is fused by inverse covariances; the fused estimate is the next step's prior.  What is measured has `noise` times the
+    variance that the filters take it to have.
     """
     truth = np.zeros((runs, 2))
     x = rng.normal(size=(runs, agents, 2)) @ np.linalg.cholesky(P0).T + np.array(error)
@@ -37,7 +38,7 @@ def naive(µ, runs, rng, agents=2, error=(0.0, 0.0)):
         if k > 0:
             truth = truth @ F.T + rng.normal(size=(runs, 2)) @ np.linalg.cholesky(Q).T
             x, P = x @ F.T, F @ P @ F.T + Q
-            z = (truth @ H.T)[:, None] + np.sqrt(R) * rng.normal(size=(runs, agents, 1))
+            z = (truth @ H.T)[:, None] + np.sqrt(noise * R) * rng.normal(size=(runs, agents, 1))
             K = P @ H.T / (H @ P @ H.T + R)
             x = x + (K @ (z - x @ H.T)[..., None])[..., 0]
             P = P - K @ H @ P

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -18,6 +18,7 @@ from stochfuse.kalman.metrics import metric
 from stochfuse.scenario.scenario import link_rows
 from tests.cli.command import run as command
 from tests.cli.command import strict_json
+from tests.data.simulators import SCENARIO, naive, table
 from tests.oracles.faulty_simulators import Ways, World, faulty, simulate, trace
 
 WALK = World(F=1.0, H=1.0, Q=25.0, R=100.0, P0=100.0, agents=2, steps=3)
@@ -115,6 +116,30 @@ def test_means_alone_will_do():
     rows = {"step": [1, 2, 3], "link": [0.3] * 3, "covariance": P.mean(axis=(0, 2)), "count": [4000] * 3}
     first = sf.crosscheck(rows, scenario(WALK)).causes[0]
     assert (first.cause, first.explains) == ("one-minus-link", True)
+
+
+@pytest.mark.slow
+def test_what_begins_late_is_looked_at():
+    """Right for eleven steps, then 1.3 times too large."""
+    s = sf.load_scenario(WALK.source(), steps=14)
+    means = sf.predict(s, [0.5], "simplified").values()[0] * np.where(np.arange(1, 15) < 12, 1.0, 1.3)
+    rows = {"step": np.arange(1, 15), "link": [0.5] * 14, "covariance": means, "std": 0.3 * means, "count": [4000] * 14}
+    causes = sf.crosscheck(rows, s, method="simplified").causes
+    assert not any(c.explains for c in causes)
+    assert {(c.until, c.last) for c in causes} == {(12, 14)}
+    assert "explains the numbers of steps up to 12 (of 14); nearest" in summary(causes)
+
+
+def test_what_explains_the_first_steps_is_tried_on_all():
+    """R of what is measured a quarter of what the filters are told: their claims are right."""
+    data = table(partial(naive, noise=0.25), [0.5], 2000, np.random.default_rng(0))
+    some = {name: data[name] for name in ("run", "agent", "step", "link", "squared_error", "covariance")}
+    verdict = sf.crosscheck(some, sf.load_scenario(SCENARIO), estimator="naive")
+    first = verdict.causes[0]
+    assert (first.cause, first.explains) == ("R-scaled", True)
+    assert first.estimate == pytest.approx(0.25, rel=0.1)
+    assert "(in the truth alone)" in first.text
+    assert (first.until, first.scope) == (first.last, "")
 
 
 @pytest.mark.slow
