@@ -10,7 +10,7 @@ The reader says what it wants as `ColumnField`s, and gets NumPy columns that nee
 Everything else is refused with its place: "results.csv, line 7, column 'step': expected …, got …".  Lines of CSV and
 records of JSON and Parquet count from 1; rows of arrays and data frames from 0, as `iloc` does.
 
-Files are read part by part; how, and what separates cells and lines, is said in `stochfuse.data.tables`.
+How files are read, and what separates cells and lines, is said in `stochfuse.data.tables`.
 """
 
 from __future__ import annotations
