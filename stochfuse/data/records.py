@@ -343,7 +343,7 @@ def _runs(tables: Mapping[str, _RawTable]) -> tuple[str, ...]:
     names = list(found)
     if not names:
         return ALONE
-    if all(name.lstrip("-").isdigit() for name in names):
+    if all(name.removeprefix("-").isdecimal() for name in names):
         names.sort(key=int)
     for what, table in tables.items():
         there = set(names if table.run is None else table.run.names)
