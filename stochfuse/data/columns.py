@@ -10,7 +10,7 @@ The reader says what it wants as `ColumnField`s, and gets NumPy columns that nee
 Everything else is refused with its place: "results.csv, line 7, column 'step': expected …, got …".  Lines of CSV and
 records of JSON and Parquet count from 1; rows of arrays and data frames from 0, as `iloc` does.
 
-Files are read part by part; how, and what separates cells and lines, is said in `stochfuse.data.tables`.
+How files are read, and what separates cells and lines, is said in `stochfuse.data.tables`.
 """
 
 from __future__ import annotations
@@ -123,9 +123,17 @@ class Columns:
         return f"{where}, column '{column}'" if column else where
 
     def said(self, row: int, column: str) -> str:
-        """Return what a cell of a column of texts says, in quotation marks."""
+        """Return what a cell says: a number, or a text in quotation marks."""
+        if column in self.number:
+            return f"{self.number[column][row]:g}"
         codes, names = self.text[column]
         return f"'{names[codes[row]]}'"
+
+    def refuse(self, wrong: np.ndarray, column: str, expected: str, more: Callable[[str], str] = str) -> None:
+        """Raise the error of the first row that is wrong (rows,), if one is; `more` adds to what its cell says."""
+        if wrong.any():
+            row = int(wrong.argmax())
+            raise self.error(row, column, expected, more(self.said(row, column)))
 
     def error(self, row: int, column: str, expected: str, got: object) -> ColumnsError:
         """Return the error of a cell that a reader cannot use."""

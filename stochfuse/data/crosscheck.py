@@ -322,7 +322,7 @@ def _agents(results: SimulatorResults, prediction: Prediction) -> np.ndarray | N
 
 
 def _whole(text: str) -> int:
-    return int(text) if text.isdigit() else 0
+    return int(text) if text.isdecimal() else 0
 
 
 def _families(results: SimulatorResults, prediction: Prediction, metric: Metric) -> tuple[list[Family], list[str]]:

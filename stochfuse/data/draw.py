@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -38,25 +37,6 @@ ARRIVALS, NOISES, DETECTIONS = 0, 1, 2
 """What a stream of random numbers is for."""
 DEPARTS = 1e-6
 """Largest part of its size by which a nominal path may depart from the model without a word."""
-
-
-class Drawn(NamedTuple):
-    """Truth and measurements of some runs.
-
-    Parameters
-    ----------
-    truth : (runs, steps, agents, d) true states.
-    z : by agent, (runs, steps, p) measurements; NaN where nothing was measured.
-    relations : by pair of agents, (runs, steps, p) what one measured of the other.
-    missed : (runs, steps, agents) whether an agent that has a sensor measured nothing, unless by its very H.
-    first : by agent, (runs, d, 1) first estimates.
-    """
-
-    truth: np.ndarray
-    z: tuple[np.ndarray, ...]
-    relations: dict[tuple[int, int], np.ndarray]
-    missed: np.ndarray
-    first: tuple[np.ndarray, ...]
 
 
 def drawn_arrivals(system: System, links: LinkRows, missed: np.ndarray, seed: int, first: int = 0) -> ArrivalRecord:
@@ -94,35 +74,6 @@ def _streams(seed: int, what: int, first: int, runs: int) -> Iterator[np.random.
     """Random numbers of every run."""
     for run in range(first, first + runs):
         yield np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(what, run)))
-
-
-def drawn(
-    system: System,
-    functions: Sequence[Function | None],
-    start: np.ndarray,
-    runs: int,
-    seed: int,
-    first: int = 0,
-) -> Drawn:
-    """Draw truth and measurements of some runs.
-
-    Parameters
-    ----------
-    functions : by agent, what its sensor measures where that is not linear; may be empty.
-    start : (d, 1) true state at step 1.
-    runs, seed, first : how many runs, the seed of all, and the number of the first of these.
-    """
-    functions = tuple(functions) or (None,) * system.agents
-    missed = _misses(system, runs, seed, first)
-    world = _Runs(system, functions, start, _streams(seed, NOISES, first, runs))
-    truth, z, relations, begun = world.drawn()
-    if system.filters and not system.own:
-        _check_one_truth(truth)
-    for agent, each in enumerate(z):
-        each[missed[:, :, agent]] = np.nan
-        if functions[agent] is not None:  # its matrices are made where it measures, whatever the nominal path says
-            missed[:, 1:, agent] = np.isnan(each[:, 1:, 0])
-    return Drawn(truth, tuple(z), relations, missed, tuple(begun))
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,25 +120,34 @@ class Draws:
         """Draw some runs at a time."""
         system, runs = self.scenario.system, len(self.names)
         size = max(1, NUMBERS // (system.agents * system.steps))
-        nominal = self.scenario.nominal
-        start = system.x0 if nominal is None else nominal[0][:, None]
         for first in range(0, runs, size):
-            count = min(size, runs - first)
-            found = drawn(system, self.scenario.instruments, start, count, self.seed, first)
-            arrivals = drawn_arrivals(system, self.links, found.missed, self.seed, first)
-            batch = RecordedRuns(
-                np.arange(first, first + count),
-                tuple(np.nan_to_num(z) for z in found.z),
-                found.relations,
-                arrivals,
-                found.missed,
-                found.truth,
-                found.first,
-            )
-            if self.write is not None:
-                seen = [~np.isnan(z[..., 0]) for z in found.z]
-                self.write(batch, self.names[first : first + count], seen.__getitem__)
-            yield batch
+            yield self._batch(first, min(size, runs - first))
+
+    def _batch(self, first: int, count: int) -> RecordedRuns:
+        system, nominal = self.scenario.system, self.scenario.nominal
+        functions = self.scenario.instruments or (None,) * system.agents
+        start = system.x0 if nominal is None else nominal[0][:, None]
+        missed = _misses(system, count, self.seed, first)
+        truth, z, relations, begun = _Runs(system, functions, start, _streams(self.seed, NOISES, first, count)).drawn()
+        if system.filters and not system.own:
+            _check_one_truth(truth)
+        for agent, each in enumerate(z):
+            each[missed[:, :, agent]] = np.nan
+            if functions[agent] is not None:  # its matrices are made where it measures, whatever the nominal path says
+                missed[:, 1:, agent] = np.isnan(each[:, 1:, 0])
+        batch = RecordedRuns(
+            np.arange(first, first + count),
+            tuple(np.nan_to_num(each) for each in z),
+            relations,
+            drawn_arrivals(system, self.links, missed, self.seed, first),
+            missed,
+            truth,
+            tuple(begun),
+        )
+        if self.write is not None:
+            seen = [~np.isnan(each[..., 0]) for each in z]
+            self.write(batch, self.names[first : first + count], seen.__getitem__)
+        return batch
 
 
 def _misses(system: System, runs: int, seed: int, first: int) -> np.ndarray:

@@ -209,6 +209,15 @@ class Knowledge:
         """The next step: predict, measure unless the sensor missed, forget."""
         raise NotImplementedError
 
+    def local(self, information: Information | None, missed: bool) -> Information:
+        """Local estimate of this step, from what was fused in the one before, unless the sensor missed."""
+        local = self.setting.forward(information, self.now)  # pyright: ignore[reportArgumentType]
+        if missed:
+            return local
+        self.linearise(from_information(local).x)
+        y, Y = self.setting.measured(self.now)
+        return Information(local.y + y, local.Y + Y)
+
     def linearise(self, prior: np.ndarray) -> None:
         """Linearise the agent's sensor about its prediction."""
         at = getattr(self.setting.riding, "linearised", None)
@@ -313,12 +322,7 @@ class Graph(Gossip):
         """Local estimate (24)–(27)."""
         claim = self.claim()
         self.now += 1
-        local = self.setting.forward(claim.information, self.now)  # pyright: ignore[reportArgumentType]
-        if not missed:
-            self.linearise(from_information(local).x)
-            y, Y = self.setting.measured(self.now)
-            local = Information(local.y + y, local.Y + Y)
-        self._step(claim, local.y, local.Y)
+        self._step(claim, *self.local(claim.information, missed))
 
     def fused(self) -> Claim:
         """Fuse(own ∪ heard); what that cannot be told of enters by covariance intersection, or waits."""
@@ -617,13 +621,8 @@ class Latest(Knowledge):
         """Local estimate (23)–(27), or what the estimator does in its place."""
         if self.estimator is None:
             information = self.claim().information
-            local = self.setting.forward(information, self.now + 1)  # pyright: ignore[reportArgumentType]
             self._over()
-            if not missed:
-                self.linearise(from_information(local).x)
-                y, Y = self.setting.measured(self.now)
-                local = Information(local.y + y, local.Y + Y)
-            self.own = self._node(local.y, local.Y)
+            self.own = self._node(*self.local(information, missed))
             return
         fused, numbers = self._fused(self.estimator)
         before = self.own

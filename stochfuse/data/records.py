@@ -343,7 +343,7 @@ def _runs(tables: Mapping[str, _RawTable]) -> tuple[str, ...]:
     names = list(found)
     if not names:
         return ALONE
-    if all(name.lstrip("-").isdigit() for name in names):
+    if all(name.removeprefix("-").isdecimal() for name in names):
         names.sort(key=int)
     for what, table in tables.items():
         there = set(names if table.run is None else table.run.names)
@@ -454,10 +454,8 @@ class _ScenarioReader:
             if relation is None:
                 raise found.error(row, "of", "an agent that the scenario lets it measure", found.said(row, "of"))
             expected[row] = relation.R.shape[-1]
-        blind = expected == 0
-        if (blind & ~np.isnan(values).all(axis=1)).any():
-            row = int((blind & ~np.isnan(values).all(axis=1)).argmax())
-            raise found.error(row, "agent", "an agent with a sensor", f"{found.said(row, 'agent')} without one")
+        blind = (expected == 0) & ~np.isnan(values).all(axis=1)
+        found.refuse(blind, "agent", "an agent with a sensor", lambda said: f"{said} without one")
         self._check_width(found, values, expected, z)
         step = found.number["step"] - 1
         early = int((~np.isnan(values[:, 0]) & (step == 0)).sum())
@@ -574,12 +572,10 @@ class _ScenarioReader:
         numbers = np.array([self.agents.get(name.strip(), -1) for name in names] or [-1])
         out = np.where(codes >= 0, numbers[codes], -1)
         wrong = (out < 0) & (codes >= 0) if blank else out < 0
-        if wrong.any():
-            row, n = int(wrong.argmax()), self.scenario.network.agents
-            known = self.scenario.network.names
-            listed = f", or {', '.join(known[:6])}{', …' if len(known) > 6 else ''}" if known else ""
-            said = found.said(row, column)
-            raise found.error(row, column, f"an agent from 1 to {n}{listed}", said + nearest(said[1:-1], known))
+        n, known = self.scenario.network.agents, self.scenario.network.names
+        listed = f", or {', '.join(known[:6])}{', …' if len(known) > 6 else ''}" if known else ""
+        expected = f"an agent from 1 to {n}{listed}"
+        found.refuse(wrong, column, expected, lambda said: said + nearest(said[1:-1], known))
         return out
 
     def _check_size(self, found: Columns, values: np.ndarray, names: Sequence[str], expected: str) -> None:
@@ -604,9 +600,7 @@ class _ScenarioReader:
     def _check_messages(
         self, found: Columns, receiver: np.ndarray, sender: np.ndarray, step: np.ndarray, sent: np.ndarray
     ) -> None:
-        if (receiver == sender).any():
-            row = int((receiver == sender).argmax())
-            raise found.error(row, "receiver", "another agent than the sender", found.said(row, "receiver"))
+        found.refuse(receiver == sender, "receiver", "another agent than the sender")
         if (sent > step).any():
             row = int((sent > step).argmax())
             raise found.error(row, "sent_step", f"a step up to {step[row] + 1}", sent[row] + 1)

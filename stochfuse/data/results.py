@@ -220,8 +220,7 @@ def _links(table: Columns) -> Labels:
     codes, names = table.text["link"]
     if (codes < 0).any():
         if len(names):
-            row = int((codes < 0).argmax())
-            raise table.error(row, "link", "a link probability or a case, as in other rows", "nothing")
+            table.refuse(codes < 0, "link", "a link probability or a case, as in other rows", lambda _: "nothing")
         return Labels(np.zeros(table.length, dtype=np.int32), ("",))
     texts = [_link(name) for name in names]
     alike = list(dict.fromkeys(texts))

@@ -102,7 +102,7 @@ class RobotPath(NamedTuple):
     pairs: int
 
 
-def course(record: RobotRecord, noises: ChannelNoises) -> RobotPath:
+def course_of(record: RobotRecord, noises: ChannelNoises) -> RobotPath:
     """Take the identified constants out of a record."""
     V, omega = record.odometry[..., 0], record.odometry[..., 1]
     V = V * (1.0 - noises.speed.mean) - noises.turning_loss * np.abs(omega)

@@ -33,7 +33,7 @@ from stochfuse.data.robot_filters import (
     RobotMoments,
     RobotPath,
     assumed,
-    course,
+    course_of,
     filtered,
 )
 from stochfuse.data.robots import RobotRecord, read_robots
@@ -151,19 +151,19 @@ def run_robots(
     if isinstance(noises, str):
         noises = identify(record, 0.0, until).white() if white else identify(record, 0.0, until)
     used = record if landmarks is None else record.with_landmarks(landmarks)
-    course_, last = course(used, noises), record.step_at(until)
+    course, last = course_of(used, noises), record.step_at(until)
     told = assumed(record, noises, last)
-    alone = _alone(course_, noises, told, last)
+    alone = _alone(course, noises, told, last)
     if not white:
         told = told.scaled(alone.factor)
-    items = _ArrivalDraws.drawn(link, runs, course_.pairs, seed)
-    others = _ArrivalDraws.drawn(link, runs, course_.pairs, seed, other=True)
+    items = _ArrivalDraws.drawn(link, runs, course.pairs, seed)
+    others = _ArrivalDraws.drawn(link, runs, course.pairs, seed, other=True)
     rows: list[RobotRow] = []
     for k, name in enumerate(estimators):
         listener().advance(name, 2 * k, 2 * len(estimators))
-        real = _realised(course_, name, told, items, last)
+        real = _realised(course, name, told, items, last)
         listener().advance(f"{name}, predicted", 2 * k + 1, 2 * len(estimators))
-        rows += _rows(name, record, real, _expected(course_, name, told, noises, alone.path, others, last), items)
+        rows += _rows(name, record, real, _expected(course, name, told, noises, alone.path, others, last), items)
     return RobotRun(used, noises, until, runs, white, tuple(rows), alone.error, alone.deviation)
 
 
@@ -212,19 +212,19 @@ class _Alone(NamedTuple):
     factor: np.ndarray
 
 
-def _alone(course_: RobotPath, noises: ChannelNoises, told: Assumed, last: int) -> _Alone:
+def _alone(course: RobotPath, noises: ChannelNoises, told: Assumed, last: int) -> _Alone:
     """Every robot by itself: the path that it believes in, and by what its claim is to be scaled."""
-    record, nobody = course_.record, np.zeros((1, course_.pairs, 2), dtype=bool)
-    followed = Followed(course_, 1)
+    record, nobody = course.record, np.zeros((1, course.pairs, 2), dtype=bool)
+    followed = Followed(course, 1)
     path, realised = [], []
-    for moment in filtered(course_, "stand-alone", told, nobody, followed):
+    for moment in filtered(course, "stand-alone", told, nobody, followed):
         path.append(followed.x[0].copy())
         realised.append(_errors(followed, record, moment)[1][0])
     path = np.array(path)
-    expected = RobotMoments(course_, noises, path, 1)
+    expected = RobotMoments(course, noises, path, 1)
     first, n = min(record.step_at(FORGOTTEN), last // 2), len(record.robots)
     deviation, ratio = np.zeros_like(path), np.zeros((record.steps, n))
-    for moment in filtered(course_, "stand-alone", told, nobody, expected):
+    for moment in filtered(course, "stand-alone", told, nobody, expected):
         E = expected.blocks()
         deviation[moment.step] = np.sqrt(np.diagonal(E[0], axis1=-2, axis2=-1))
         ratio[moment.step] = np.trace(np.linalg.solve(moment.claims[0], E[0]), axis1=-2, axis2=-1) / 3.0
@@ -250,18 +250,18 @@ class _Found(NamedTuple):
     nees: np.ndarray
 
 
-def _realised(course_: RobotPath, name: str, told: Assumed, items: _ArrivalDraws, last: int) -> _Found:
-    followed, found = Followed(course_, len(items.heard)), []
-    for moment in filtered(course_, name, told, items.heard, followed):
+def _realised(course: RobotPath, name: str, told: Assumed, items: _ArrivalDraws, last: int) -> _Found:
+    followed, found = Followed(course, len(items.heard)), []
+    for moment in filtered(course, name, told, items.heard, followed):
         if moment.step <= last:
             continue
-        e, nees = _errors(followed, course_.record, moment)
+        e, nees = _errors(followed, course.record, moment)
         found.append((e[..., 0] ** 2 + e[..., 1] ** 2, moment.claims[..., [0, 1], [0, 1]].sum(axis=-1), nees))
     return _Found(*map(np.array, zip(*found, strict=True)))
 
 
 def _expected(
-    course_: RobotPath,
+    course: RobotPath,
     name: str,
     told: Assumed,
     noises: ChannelNoises,
@@ -269,8 +269,8 @@ def _expected(
     items: _ArrivalDraws,
     last: int,
 ) -> _Found:
-    expected, found = RobotMoments(course_, noises, path, len(items.heard)), []
-    for moment in filtered(course_, name, told, items.heard, expected):
+    expected, found = RobotMoments(course, noises, path, len(items.heard)), []
+    for moment in filtered(course, name, told, items.heard, expected):
         if moment.step <= last:
             continue
         E = expected.blocks()

@@ -198,9 +198,7 @@ def _table(path: Path, fields: tuple[ColumnField, ...]) -> Columns:
         raise UsageError(f"{path}: expected a table with columns {', '.join(f.name for f in fields)}, found no file")
     found = read_columns(str(path), fields)
     for field in fields:
-        wrong = np.flatnonzero(~np.isfinite(found.number[field.name]))
-        if len(wrong):
-            raise found.error(int(wrong[0]), field.name, "a finite number", found.number[field.name][wrong[0]])
+        found.refuse(~np.isfinite(found.number[field.name]), field.name, "a finite number")
     return found
 
 
@@ -230,11 +228,7 @@ def _on_clock(
         if len(rows) != len(times):
             raise table.error(int(rows[-1]), "time", f"{len(times)} rows of robot {number} in all", len(rows))
         values.append(np.stack([table.number[name][rows] for name in names], axis=1))
-    stranger = np.flatnonzero(~np.isin(robot, robots))
-    if len(stranger):
-        raise table.error(
-            int(stranger[0]), "robot", f"one of {', '.join(map(str, robots))}, as in odometry.csv", robot[stranger[0]]
-        )
+    table.refuse(~np.isin(robot, robots), "robot", f"one of {', '.join(map(str, robots))}, as in odometry.csv")
     assert times is not None
     return times, np.stack(values, axis=1)
 
@@ -248,18 +242,14 @@ def _sightings(table: Columns, numbers: tuple[int, ...], n: int, times: np.ndarr
         ("subject", subject == robot, "another than the robot itself"),
         ("range", table.number["range"] <= 0, "a distance above 0"),
     ):
-        rows = np.flatnonzero(wrong)
-        if len(rows):
-            raise table.error(int(rows[0]), column, expected, f"{table.number[column][rows[0]]:g}")
+        table.refuse(wrong, column, expected)
     back = np.flatnonzero(np.diff(time) < 0)
     if len(back):
         row = int(back[0]) + 1
         raise table.error(row, "time", f"times in order, {time[row - 1]:g} or later", f"{time[row]:g}")
     T = times[1] - times[0]
-    outside = np.flatnonzero((time < times[0] - T) | (time > times[-1] + T))
-    if len(outside):
-        expected = f"a time from {times[0]:g} to {times[-1]:g} s, as in odometry.csv"
-        raise table.error(int(outside[0]), "time", expected, f"{time[outside[0]]:g}")
+    outside = (time < times[0] - T) | (time > times[-1] + T)
+    table.refuse(outside, "time", f"a time from {times[0]:g} to {times[-1]:g} s, as in odometry.csv")
     step = np.clip(np.rint((time - times[0]) / T).astype(int), 0, len(times) - 1)
     after = time - times[step]
     # the odometry of the interval in which the sighting fell

@@ -239,7 +239,7 @@ class Sampler:
         if simulator.metric is not None and claims <= {simulator.metric.name}:
             raise UsageError(f"metric: expected another than {simulator.metric.name}, which is what is shown")
         histories = self._histories(simulator)
-        look = _EstimateTests(simulator, histories, self.errors)
+        look = _SampledReading(simulator, histories, self.errors)
         return [np.stack([look.at(cell, block.row) for cell in block.cells], axis=1) for block in blocks]
 
     def _histories(self, simulator: Simulator) -> _RunArrivals:
@@ -367,7 +367,7 @@ class _Reading:
         return np.asarray(m.bias)[..., states[0], 0]
 
 
-class _EstimateTests:
+class _SampledReading:
     """What can be seen of the estimates of a simulator, worked out once for every different estimate."""
 
     def __init__(self, simulator: Simulator, histories: _RunArrivals, errors: bool) -> None:

@@ -42,7 +42,9 @@ NEAR, LOW = 0.2, 0.15
 """Least departure that is looked at: of a mean square from 1, of a mean or autocorrelation from 0."""
 AGENTS = 6
 """Agents suspected one by one: those that are farthest off."""
-SWALLOW = ("R-scaled", "Q-scaled", "P-scaled")
+COMMON = {"Q-scaled": ("process", "process noise: a Q"), "P-scaled": ("start", "first estimates: a P")}
+"""Covariances that all agents have in common: factors of a `Supposition`, and what they are called."""
+SWALLOW = ("R-scaled", *COMMON)
 """What explains anything to some degree."""
 ROUNDS = 3
 """Suspicions told of a record at most."""
@@ -314,13 +316,19 @@ def _gain(trial: _CaseSuspicions, about: _CaseSuspicions, truth: np.ndarray) -> 
 
 def _truths(truth: np.ndarray) -> Iterator[tuple[str, str, np.ndarray]]:
     """What else the truth may be."""
-    late, early = np.full_like(truth, np.nan), np.full_like(truth, np.nan)
-    late[:, :-1], early[:, 1:] = truth[:, 1:], truth[:, :-1]
-    yield "truth-late", "its states one step late", late
-    yield "truth-early", "its states one step early", early
+    yield "truth-late", "its states one step late", _moved(truth, -1)
+    yield "truth-early", "its states one step early", _moved(truth, 1)
     yield "truth-thousandth", "1000 times too small (kilometres for metres?)", 1000.0 * truth
     yield "truth-thousandfold", "1000 times too large (millimetres for metres?)", 0.001 * truth
     yield "truth-sign", "of the wrong sign", -truth
+
+
+def _moved(values: np.ndarray, by: int) -> np.ndarray:
+    """Values (runs, steps, …) a step earlier, by = −1, or later; NaN where there is none."""
+    out = np.full_like(values, np.nan)
+    kept, put = (slice(1, None), slice(None, -1)) if by < 0 else (slice(None, -1), slice(1, None))
+    out[:, put] = values[:, kept]
+    return out
 
 
 def _how(what: str, before: float, after: float, *, explains: bool) -> str:
@@ -401,8 +409,8 @@ class _CaseSuspicions:
         for i, j in combinations(self.agents, 2):
             yield from self._swapped(i, j)
         for factor in FACTORS[FACTORS != 1.0]:
-            yield self._process(factor)
-            yield self._start(factor)
+            for name in COMMON:
+                yield self._scaled_common(name, factor)
 
     def _who(self) -> Iterator[Sequence[int]]:
         yield from ([i] for i in self.agents)
@@ -463,22 +471,17 @@ class _CaseSuspicions:
             case = case.with_agent(i, noise=case.noise[i] * factor)
         return case
 
-    def _process(self, factor: float) -> FittedCase:
-        case = self.case._replace(process=self.case.process * factor)
-        return FittedCase("Q-scaled", None, f"process noise: a Q of {factor:.2g} times the scenario's", case, 1)
-
-    def _start(self, factor: float) -> FittedCase:
-        case = self.case._replace(start=self.case.start * factor)
-        return FittedCase("P-scaled", None, f"first estimates: a P of {factor:.2g} times the scenario's", case, 1)
+    def _scaled_common(self, name: str, factor: float) -> FittedCase:
+        field, said = COMMON[name]
+        case = self.case._replace(**{field: getattr(self.case, field) * factor})
+        return FittedCase(name, None, f"{said} of {factor:.2g} times the scenario's", case, 1)
 
     def _shifted(self, agent: int) -> Iterator[FittedCase]:
         number, called = self._called([agent])
-        for by, name, said in ((-1, "late", "late"), (1, "early", "early")):
-            z = np.full_like(self.case.z[agent], np.nan)
-            kept, put = (slice(1, None), slice(None, -1)) if by < 0 else (slice(None, -1), slice(1, None))
-            z[:, put] = self.case.z[agent][:, kept]
+        for by, name in ((-1, "late"), (1, "early")):
+            z = _moved(self.case.z[agent], by)
             z[:, 0] = np.nan
-            yield FittedCase(name, number, f"{called}: its clock one step {said}", self.case.with_agent(agent, z=z))
+            yield FittedCase(name, number, f"{called}: its clock one step {name}", self.case.with_agent(agent, z=z))
 
     def _exchanged(self, agent: int) -> Iterator[FittedCase]:
         number, called = self._called([agent])
@@ -510,10 +513,9 @@ class _CaseSuspicions:
             number, _ = self._called(who)
             for factor in self._between("R-scaled", number, tried, found):
                 yield self._scaled_noise(who, factor)
-        for factor in self._between("Q-scaled", None, tried, found):
-            yield self._process(factor)
-        for factor in self._between("P-scaled", None, tried, found):
-            yield self._start(factor)
+        for name in COMMON:
+            for factor in self._between(name, None, tried, found):
+                yield self._scaled_common(name, factor)
 
     def _biased(self, agent: int, tried: Sequence[FittedCase], found: Innovations) -> Iterator[FittedCase]:
         places = [i for i, each in enumerate(tried, start=1) if not each.name and each.agent == agent]

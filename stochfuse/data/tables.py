@@ -1,9 +1,9 @@
-"""Where a table comes from: CSV, Parquet, JSON, standard input, arrays or a data frame, opened and read part by part.
+"""Where a table comes from: CSV, Parquet, JSON, standard input, arrays or a data frame, opened and read.
 
-CSV is read in blocks of whole lines, Parquet in batches.  pyarrow parses a block where it is installed; what it does
-not take (and every block without it) goes through Python's own csv, which has the last word on what is a number and
-what a message says.  So both give the same.  Lines that are blank or begin with # are skipped.  A comma, a semicolon or
-a tab separates cells, whichever separates the headings.  A cell ends on its line.
+CSV is read in blocks of whole lines.  pyarrow parses a block where it is installed; what it does not take (and every
+block without it) goes through Python's own csv, which has the last word on what is a number and what a message says.
+So both give the same.  Lines that are blank or begin with # are skipped.  A comma, a semicolon or a tab separates
+cells, whichever separates the headings.  A cell ends on its line.
 
 What the columns are is none of its business: `stochfuse.data.columns` checks them.
 """
@@ -27,9 +27,9 @@ from stochfuse.errors import UsageError, needed
 NUMBER, WHOLE, TEXT, LABEL = "number", "whole", "text", "label"
 BLOCK = 8_000_000
 """Bytes of a CSV file that are parsed at once."""
-BATCH = 500_000
-"""Rows of a Parquet file, of arrays or of records that are looked at together."""
 SUFFIXES = (".parquet", ".pq")
+_FROM_0, _FROM_1 = ((np.array([0]), np.array([first])) for first in (0, 1))
+"""Stretches of rows on adjacent lines, as `Columns` has them: one, numbered from 0 or 1."""
 
 
 class ColumnsError(UsageError):
@@ -72,7 +72,10 @@ class Raw(NamedTuple):
 
 
 class OpenedTable(NamedTuple):
-    """Where a table comes from, its headings, and its rows part by part, given places and kinds of what is wanted."""
+    """Where a table comes from, its headings, and its rows part by part, given places and kinds of what is wanted.
+
+    Only CSV has several parts.
+    """
 
     name: str
     what: str
@@ -324,16 +327,13 @@ def _of_parquet(path: Path, stack: ExitStack) -> OpenedTable:
     header = tuple(file.schema_arrow.names)
 
     def parts(kinds: Mapping[int, str]) -> Iterator[Raw]:
-        done, wanted = 0, [header[place] for place in kinds]
-        for batch in file.iter_batches(BATCH, columns=wanted, use_threads=False):
-            yield Raw(
-                batch.num_rows,
-                lambda place, kind, batch=batch: _of_arrow(batch.column(header[place]), kind),
-                lambda row, place, batch=batch: batch.column(header[place])[row].as_py(),
-                np.array([0]),
-                np.array([done + 1]),
-            )
-            done += batch.num_rows
+        table = file.read([header[place] for place in kinds], use_threads=False)
+        yield Raw(
+            table.num_rows,
+            lambda place, kind: _of_arrow(table.column(header[place]), kind),
+            lambda row, place: table.column(header[place])[row].as_py(),
+            *_FROM_1,
+        )
 
     return OpenedTable(str(path), "record", header, parts)
 
@@ -352,7 +352,7 @@ def _of_json(name: str, text: bytes) -> OpenedTable:
     lengths = {key: len(column) if isinstance(column, list) else None for key, column in made.items()}
     if len(set(lengths.values())) > 1 or None in lengths.values():
         raise ColumnsError(f"{name}: expected lists of one length, one per column, got {lengths}")
-    return _of_lists(name, "record", 1, {str(key): column for key, column in made.items()})
+    return _of_lists(name, "record", _FROM_1, {str(key): column for key, column in made.items()})
 
 
 def _of_records(name: str, records: list[Any]) -> dict[str, list[Any]]:
@@ -387,28 +387,21 @@ def _of_arrays(source: Any) -> OpenedTable:
     lengths = {key: len(column) for key, column in columns.items()}
     if len(set(lengths.values())) > 1:
         raise ColumnsError(f"{name}: expected arrays of one length, got {lengths}")
-    return _of_lists(name, "row", 0, columns)
+    return _of_lists(name, "row", _FROM_0, columns)
 
 
-def _of_lists(name: str, what: str, first: int, columns: Mapping[str, Any]) -> OpenedTable:
+def _of_lists(name: str, what: str, lines: tuple[np.ndarray, np.ndarray], columns: Mapping[str, Any]) -> OpenedTable:
     header = tuple(key.strip() for key in columns)
     lists = list(columns.values())
-    length = len(lists[0]) if lists else 0
 
     def parts(kinds: Mapping[int, str]) -> Iterator[Raw]:
-        for start in range(0, length, BATCH):
-            yield Raw(
-                min(BATCH, length - start),
-                lambda place, kind, start=start: _list_part(lists[place][start : start + BATCH], kind),
-                lambda row, place, start=start: lists[place][start + row],
-                np.array([0]),
-                np.array([start + first]),
-            )
+        length = len(lists[0]) if lists else 0
+        yield Raw(length, lambda place, kind: _list(lists[place], kind), lambda row, place: lists[place][row], *lines)
 
     return OpenedTable(name, what, header, parts)
 
 
-def _list_part(cells: Any, kind: str) -> Any:
+def _list(cells: Any, kind: str) -> Any:
     """Texts of numbers (names of runs, link probabilities) by the different ones alone."""
     if kind == TEXT and isinstance(cells, np.ndarray) and cells.dtype.kind in "iuf":
         used, codes = np.unique(cells, return_inverse=True)

@@ -21,7 +21,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 CONFIDENCE = 0.95
 LONGEST_LINE = 1 << 20
 """Letters of a line of text beyond which a file is none of these."""
+MOST_PACKETS = 50_000_000
+"""Packets that are told apart where a log has the received ones alone."""
 WRAP = 1 << 16
 LARGEST = float(1 << 53)
 """Whole numbers up to which a file's are told apart."""
@@ -386,58 +388,77 @@ def links_of_packets(table: Mapping[str, Any], *, source: str = "table", step: f
     if not n:
         raise UsageError(f"{source}: expected packets, got no rows")
     seq = _numbers(source, table, "seq", whole=True) if "seq" in table else None
-    notes = []
     if seq is not None:
         _refuse(source, "seq", seq, seq < 0, "a number of at least 0")
     pair = r * n + s
     if "received" in table:
-        got = _numbers(source, table, "received", whole=True)
-        _refuse(source, "received", got, (got != 0) & (got != 1), "0 or 1")
-        got = got.astype(bool)
-        if seq is not None:
-            # a packet that is reported twice was sent once, and arrived if it arrived once
-            key, where = _distinct(pair, seq)
-            arrived = np.zeros(len(key), dtype=bool)
-            arrived[where[got]] = True
-            if len(key) < len(pair):
-                notes.append(f"{len(pair) - len(key):,} rows repeat a packet; each is counted once")
-            pair, seq, got = key[:, 0], key[:, 1], arrived
-        sent = np.bincount(pair, minlength=n * n).reshape(n, n)
-        heard = np.bincount(pair, got, minlength=n * n).reshape(n, n).astype(int)
-        bits = None if seq is None else (pair, seq, got)
+        found = _of_all(source, table, pair, seq, n)
+    elif seq is not None:
+        found = _of_received(pair, _unwrapped(s, seq, table, source), n)
     else:
-        if seq is None:
-            raise UsageError(f"{source}: expected a column seq or received, got neither")
-        seq = _unwrapped(s, seq, table, source)
-        key, _ = _distinct(pair, seq)
-        if len(key) < len(pair):
-            notes.append(f"{len(pair) - len(key):,} rows repeat a packet; each is counted once")
-        heard = np.bincount(key[:, 0], minlength=n * n).reshape(n, n)
-        first, last = np.full(n, np.iinfo(int).max), np.full(n, -1)
-        np.minimum.at(first, s, seq)
-        np.maximum.at(last, s, seq)
-        listened = heard.sum(axis=1) > 0
-        sent = np.where(listened[:, None], np.maximum(last - first + 1, 0)[None], 0)
-        np.fill_diagonal(sent, 0)
-        notes.append(
-            "only received packets are logged: what each sender sent is taken from its first to its last number"
-        )
-        bits = None
-        if sent.sum() <= 50_000_000:
-            pairs, numbers, arrived = [], [], []
-            for i, j in np.argwhere(sent > 0):
-                mine = key[key[:, 0] == i * n + j, 1] - first[j]
-                flags = np.zeros(sent[i, j], dtype=bool)
-                flags[mine] = True
-                pairs.append(np.full(len(flags), i * n + j))
-                numbers.append(np.arange(len(flags)))
-                arrived.append(flags)
-            bits = (np.concatenate(pairs), np.concatenate(numbers), np.concatenate(arrived)) if pairs else None
-    memory, burst = (None, None) if bits is None else memory_of(*bits, n)
-    delay = _delays(source, table, step)
-    return _counted(
-        source, "packet log", nodes, sent, heard, memory=memory, burst=burst, delay=delay, notes=tuple(notes)
-    )
+        raise UsageError(f"{source}: expected a column seq or received, got neither")
+    memory, burst = (None, None) if found.packets is None else memory_of(*found.packets, n)
+    more = {"memory": memory, "burst": burst, "delay": _delays(source, table, step), "notes": found.notes}
+    return _counted(source, "packet log", nodes, found.sent, found.heard, **more)
+
+
+class _Packets(NamedTuple):
+    """What a log says of packets: how many were sent and heard, (receiver, sender), and of each, link by link.
+
+    Parameters
+    ----------
+    packets : link, number and arrival of every packet; None where they have no order, or are too many.
+    """
+
+    sent: np.ndarray
+    heard: np.ndarray
+    packets: tuple[np.ndarray, np.ndarray, np.ndarray] | None
+    notes: tuple[str, ...]
+
+
+def _of_all(source: str, table: Mapping[str, Any], pair: np.ndarray, seq: np.ndarray | None, n: int) -> _Packets:
+    """Of a log of all packets, received or not."""
+    got = _numbers(source, table, "received", whole=True)
+    _refuse(source, "received", got, (got != 0) & (got != 1), "0 or 1")
+    got, again = got.astype(bool), 0
+    if seq is not None:
+        # a packet that is reported twice was sent once, and arrived if it arrived once
+        key, where = _distinct(pair, seq)
+        arrived = np.zeros(len(key), dtype=bool)
+        arrived[where[got]] = True
+        again = len(pair) - len(key)
+        pair, seq, got = key[:, 0], key[:, 1], arrived
+    sent = np.bincount(pair, minlength=n * n).reshape(n, n)
+    heard = np.bincount(pair, got, minlength=n * n).reshape(n, n).astype(int)
+    return _Packets(sent, heard, None if seq is None else (pair, seq, got), _repeated(again))
+
+
+def _of_received(pair: np.ndarray, seq: np.ndarray, n: int) -> _Packets:
+    """Of a log of received packets alone: what was sent is told by the numbers of those that anybody received."""
+    key, _ = _distinct(pair, seq)
+    heard = np.bincount(key[:, 0], minlength=n * n).reshape(n, n)
+    first, last = np.full(n, np.iinfo(int).max), np.full(n, -1)
+    np.minimum.at(first, pair % n, seq)
+    np.maximum.at(last, pair % n, seq)
+    listened = heard.sum(axis=1) > 0
+    sent = np.where(listened[:, None], np.maximum(last - first + 1, 0)[None], 0)
+    np.fill_diagonal(sent, 0)
+    note = "only received packets are logged: what each sender sent is taken from its first to its last number"
+    packets = None
+    if 0 < sent.sum() <= MOST_PACKETS:
+        links = np.flatnonzero(sent.ravel() > 0)
+        counts = sent.ravel()[links]
+        begins = np.cumsum(counts) - counts
+        arrived = np.zeros(counts.sum(), dtype=bool)
+        place = np.searchsorted(links, key[:, 0])
+        arrived[begins[place] + key[:, 1] - first[key[:, 0] % n]] = True
+        numbers = np.arange(len(arrived)) - np.repeat(begins, counts)
+        packets = np.repeat(links, counts), numbers, arrived
+    return _Packets(sent, heard, packets, (*_repeated(len(pair) - len(key)), note))
+
+
+def _repeated(again: int) -> tuple[str, ...]:
+    return (f"{again:,} rows repeat a packet; each is counted once",) if again else ()
 
 
 def _counted(

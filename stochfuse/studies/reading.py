@@ -178,21 +178,21 @@ def _several(words: str | list[str]) -> tuple[str, ...]:
 
 def _check_settings(check: Checker, axes: tuple[Axis, ...]) -> None:
     for axis in axes:
-        path = f"vary.{axis.name}"
+        path, values = f"vary.{axis.name}", axis.given or (axis.low,)
         if axis.name in _WORDS:
-            unknown = [v for v in axis.given or (axis.low,) if v not in _WORDS[axis.name]]
+            unknown = [v for v in values if v not in _WORDS[axis.name]]
             if unknown:
                 check.note(path, "one of " + ", ".join(_WORDS[axis.name]), shown(unknown[0]))
-        elif axis.name in ("runs", "seed", "max_graphs"):
+        elif axis.name in _LEAST:
             least = _LEAST[axis.name]
-            if axis.kind != "int" or min(axis.given or (axis.low,)) < least:
-                check.note(path, f"whole numbers of at least {least}", shown(min(axis.given or (axis.low,), key=str)))
+            if axis.kind != "int" or min(values) < least:
+                check.note(path, f"whole numbers of at least {least}", shown(min(values, key=str)))
         elif axis.name == "precision":
-            for given in axis.given or (axis.low,):
+            for given in values:
                 _check_share(check, path, given)
         elif axis.name == "prune":
-            if not all(isinstance(v, bool) for v in axis.given or (axis.low,)):
-                check.note(path, "true or false", shown((axis.given or (axis.low,))[0]))
+            if not all(isinstance(v, bool) for v in values):
+                check.note(path, "true or false", shown(values[0]))
         elif "." not in axis.name or not PATH.fullmatch(axis.name):
             check.note(path, f"{KEY}, or one of {', '.join(SETTINGS)}", f"'{axis.name}'")
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import stochfuse as sf
-from stochfuse.data.draw import drawn
+from stochfuse.data.draw import Draws
 from stochfuse.data.records import arrivals_of
 from stochfuse.engines.replay import replay
 from stochfuse.estimators.protocol import Late
@@ -21,6 +21,7 @@ from stochfuse.questions.messages import in_bytes
 from stochfuse.scenario import capabilities, registry
 from stochfuse.scenario.network import reachable
 from stochfuse.scenario.registry import GENERAL
+from stochfuse.scenario.scenario import link_rows
 from tests.data import udp
 from tests.oracles.featured import source as featured
 
@@ -147,14 +148,13 @@ def test_beyond_the_horizon_it_is_replay_too_and_holds_little(name, link):
 def test_sensors_that_are_not_linear_are_linearised_as_in_a_run():
     s = sf.load_scenario("two-radars").until(7)
     n, steps = s.network.agents, s.network.steps
-    made = drawn(s.system, s.instruments, s.nominal[0].reshape(-1, 1), 1, 3)
+    made = next(Draws(s, ("1",), link_rows(s, [0.5]), 3).batches())
     came = [(k, i, j, 0) for k in range(1, steps + 1) for i in range(n) for j in range(n) if i != j and (k + i) % 3]
-    z = [np.nan_to_num(each) for each in made.z]
-    stages = replayed(s, "local-fusion-graph", came, made.missed, z, s.instruments)
+    stages = replayed(s, "local-fusion-graph", came, made.missed, made.z, s.instruments)
     agents = [sf.Agent(s, i + 1) for i in range(n)]
     for k, stage in enumerate(stages, start=1):
         for i, agent in enumerate(agents if k > 1 else []):
-            agent.step(None if made.missed[0, k - 1, i] else z[i][0, k - 1])
+            agent.step(None if made.missed[0, k - 1, i] else made.z[i][0, k - 1])
         said = [agent.message() for agent in agents]
         for sent, i, j, _ in came:
             if sent == k:

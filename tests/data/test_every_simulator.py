@@ -361,6 +361,8 @@ def test_scenarios_that_do_not_fit():
         sf.crosscheck({**one, "nees": [1, 2]}, SCENARIO)
     with pytest.raises(ResultsError, match=r"row 1, column 'step': expected at most the scenario's 3 steps, got 4; see --steps"):  # fmt: skip
         sf.crosscheck({"run": [1, 2], "step": [1, 4], "nees": [1, 2]}, SCENARIO, link=0.5)
+    with pytest.raises(ResultsError, match="row 0, column 'agent': expected 1 to 2, got '²'"):
+        sf.crosscheck({**one, "agent": ["²", "²"], "nees": [1, 2]}, SCENARIO, link=0.5)
     unlike = {**SCENARIO, "agent": [{"R": 1.0}, {}]}
     with pytest.raises(ResultsError, match="arrays: the agents differ: expected a column 'agent', got none"):
         sf.crosscheck({**one, "nees": [1, 2]}, unlike, link=0.5)

@@ -11,7 +11,7 @@ import pytest
 
 import stochfuse as sf
 from stochfuse.data.robot_errors import Channel, ChannelNoises, Process, identify
-from stochfuse.data.robot_filters import ESTIMATORS, Followed, RobotMoments, _intersected, assumed, course, filtered
+from stochfuse.data.robot_filters import ESTIMATORS, Followed, RobotMoments, _intersected, assumed, course_of, filtered
 from stochfuse.data.robots import moved, read_robots, seen
 from stochfuse.errors import UsageError
 from stochfuse.fusion.extended import jacobian
@@ -112,10 +112,10 @@ def test_gross_errors_are_left_out(folder, record, tmp_path):
     clean, found = (identify(each, 0.0, 30.0) for each in (record, found_record))
     assert found.gross == pytest.approx(1 / 40, abs=0.01)
     assert found.range.variance == pytest.approx(clean.range.variance, rel=0.15)
-    course_ = course(found_record, found)
-    followed = Followed(course_, 1)
-    nobody = np.zeros((1, course_.pairs, 2), dtype=bool)
-    for moment in filtered(course_, "stand-alone", assumed(found_record, found, 120), nobody, followed):
+    course = course_of(found_record, found)
+    followed = Followed(course, 1)
+    nobody = np.zeros((1, course.pairs, 2), dtype=bool)
+    for moment in filtered(course, "stand-alone", assumed(found_record, found, 120), nobody, followed):
         assert np.hypot(*(followed.x - found_record.truth[moment.step])[0, :, :2].T).max() < 0.5
 
 
@@ -196,13 +196,13 @@ def test_moments_are_those_of_the_dense_joint_covariance(estimator, record):
         return Channel(0 * one, 0.1 * part, Process(part, 1.5), Process(0.5 * part, 3.0), 0.2 * part, one * 2, one)
 
     noises = ChannelNoises(channel(0.1), channel(0.2), channel(0.05), channel(0.01), 0.0, 0.0)
-    course_ = course(record, noises)
-    heard = np.random.default_rng(0).random((2, course_.pairs, 2)) < 0.6
-    carried = Dense(course_, noises, record.truth, 2)
+    course = course_of(record, noises)
+    heard = np.random.default_rng(0).random((2, course.pairs, 2)) < 0.6
+    carried = Dense(course, noises, record.truth, 2)
     told = assumed(record, noises, 100)
     exchanged = 0
-    for moment in filtered(course_, estimator, told, heard, carried, 60):
-        exchanged += sum(event.subject < 3 for event in course_.events[moment.step])
+    for moment in filtered(course, estimator, told, heard, carried, 60):
+        exchanged += sum(event.subject < 3 for event in course.events[moment.step])
         if moment.step % 10 == 0:
             np.testing.assert_allclose(carried.whole[:, :9, :9], carried.E, rtol=1e-9, atol=1e-14)
             np.testing.assert_allclose(carried.whole[:, :9, 9:], carried.M, rtol=1e-9, atol=1e-14)
