@@ -168,7 +168,8 @@ def _path(trial: _CaseSuspicions, without: Sequence[str]) -> tuple[list[Suspicio
         tried, after = best
         now = trial.now
         explains = not _wrong(after) or abs(after.nis() - 1.0) <= NEAR
-        how = _how("NIS", now.nis(), after.nis(), explains=explains)
+        joint = trial.setting.together and len(trial.all) > 1
+        how = _how("NIS of one joint filter" if joint else "NIS", now.nis(), after.nis(), explains=explains)
         found.append(Suspicion(tried.name, tried.agent, tried.text + how, explains))
         cost += 0.5 * tried.fitted * np.log(now.counts[0])
         trial = trial.of(tried.case, after)
@@ -236,7 +237,7 @@ def _wrong(now: Innovations) -> bool:
 def _best(
     trial: _CaseSuspicions, *, alone: bool = False, without: Sequence[str] = ()
 ) -> tuple[FittedCase, Innovations] | None:
-    """What explains most, if anything does; of one agent only; without those of some names."""
+    """What explains most, if anything does; of one agent alone, or a bias of all; without those of some names."""
     tried = list(trial.cases())
     first = innovations(trial.setting, [trial.case, *(each.case for each in tried)])
     more = list(trial.fitted(tried, first))
@@ -246,7 +247,7 @@ def _best(
     base = trial.now.likelihood[0]
     best, most = None, 2.0 * MARGIN
     for each, found, i in both:
-        if not each.name or each.name in without or (alone and each.agent is None):
+        if not each.name or each.name in without or (alone and each.agent is None and each.name != "bias"):
             continue
         value = found.likelihood[i]
         gain = np.inf if not np.isfinite(base) and np.isfinite(value) else 2.0 * (value - base)
@@ -295,6 +296,8 @@ def _about_truth(trial: _CaseSuspicions, about: _CaseSuspicions, truth: np.ndarr
         best = _best(about, alone=True)
         if best is not None:
             tried, after = best
+            if tried.agent is None:
+                tried = tried._replace(text=f"{tried.text}, or of the truth the other way,")
             choices.append((after.likelihood[0] - 0.5 * tried.fitted * np.log(truth.size), tried, after))
     for name, said, other in _truths(truth):
         gain, after = _gain(trial, about, other)
@@ -320,6 +323,8 @@ def _truths(truth: np.ndarray) -> Iterator[tuple[str, str, np.ndarray]]:
     yield "truth-early", "its states one step early", _moved(truth, 1)
     yield "truth-thousandth", "1000 times too small (kilometres for metres?)", 1000.0 * truth
     yield "truth-thousandfold", "1000 times too large (millimetres for metres?)", 0.001 * truth
+    yield "truth-feet", "in feet, not metres?", 0.3048 * truth
+    yield "truth-metres", "in metres, not feet?", truth / 0.3048
     yield "truth-sign", "of the wrong sign", -truth
 
 
@@ -507,9 +512,10 @@ class _CaseSuspicions:
 
     def fitted(self, tried: Sequence[FittedCase], found: Innovations) -> Iterator[FittedCase]:
         """Those that rest on what was found of the first."""
-        for agent in self.agents:
-            yield from self._biased(agent, tried, found)
         for who in self._who():
+            alike = len({tuple(self.units[i]) for i in who}) == 1
+            if alike and set(who) <= set(self.agents):
+                yield from self._biased(who, tried, found)
             number, _ = self._called(who)
             for factor in self._between("R-scaled", number, tried, found):
                 yield self._scaled_noise(who, factor)
@@ -517,24 +523,28 @@ class _CaseSuspicions:
             for factor in self._between(name, None, tried, found):
                 yield self._scaled_common(name, factor)
 
-    def _biased(self, agent: int, tried: Sequence[FittedCase], found: Innovations) -> Iterator[FittedCase]:
-        places = [i for i, each in enumerate(tried, start=1) if not each.name and each.agent == agent]
-        base = found.white[0].ravel()
-        slopes = np.stack([found.white[i].ravel() - base for i in places], axis=-1)
+    def _biased(self, who: Sequence[int], tried: Sequence[FittedCase], found: Innovations) -> Iterator[FittedCase]:
+        """Biases of an agent, or of all alike, that make innovations least."""
+        base, deviations = found.white[0].ravel(), np.sqrt(np.stack([self.R[i] for i in who]))
+        slopes = np.zeros((base.size, deviations.shape[1]))
+        for agent, of in zip(who, deviations, strict=True):
+            places = [i for i, each in enumerate(tried, start=1) if not each.name and each.agent == agent]
+            slopes += np.stack([found.white[i].ravel() - base for i in places], axis=-1) / of
         there = np.isfinite(base) & np.isfinite(slopes).all(axis=-1)
         if not there.any():
             return
-        number, called = self._called([agent])
-        for some in [*([c] for c in range(len(places))), list(range(len(places)))]:
-            if len(some) == len(places) > 1 or len(some) == 1:
-                size = -np.linalg.lstsq(slopes[there][:, some], base[there], rcond=None)[0]
-                if np.abs(size).max() < BIAS:
-                    continue
-                bias = np.zeros(len(places))
-                bias[some] = size * np.sqrt(self.R[agent][some])
-                case = self.case.with_agent(agent, z=self.case.z[agent] - bias)
-                said = ", ".join(f"z{c + 1} by {bias[c]:.3g}{_in(self.units[agent][c])}" for c in some)
-                yield FittedCase("bias", number, f"{called}: a bias of {said}", case, len(some))
+        number, called = self._called(who)
+        components = range(deviations.shape[1])
+        for some in [[c] for c in components] + ([list(components)] if len(components) > 1 else []):
+            bias = np.zeros(len(components))
+            bias[some] = -np.linalg.lstsq(slopes[there][:, some], base[there], rcond=None)[0]
+            if np.abs(bias / deviations).max() < BIAS:
+                continue
+            case = self.case
+            for i in who:
+                case = case.with_agent(i, z=self.case.z[i] - bias)
+            said = ", ".join(f"z{c + 1} by {bias[c]:.3g}{_in(self.units[who[0]][c])}" for c in some)
+            yield FittedCase("bias", number, f"{called}: a bias of {said}", case, len(some))
 
     def _between(self, name: str, agent: int | None, tried: Sequence[FittedCase], found: Innovations) -> list[float]:
         """Factors about the likeliest of those of a name that were tried."""

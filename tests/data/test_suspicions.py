@@ -92,7 +92,7 @@ def earlier(truth):
 
 BOTH = slice(None)
 SPOILT = [
-    ("two-radars", altered(2, 1, np.rad2deg), "degrees", 2, r"agent 2: z2 in degrees, not radians would explain it \(NIS"),
+    ("two-radars", altered(2, 1, np.rad2deg), "degrees", 2, r"agent 2: z2 in degrees, not radians would explain it \(NIS of one joint filter"),
     ("two-radars", altered(None, 1, np.rad2deg), "degrees", None, "all agents: z2 in degrees"),
     ("two-radars", altered(1, 0, lambda z: z / 1000), "kilometres", 1, "agent 1: z1 in kilometres, not metres"),
     ("two-radars", altered(None, 0, lambda z: z / 1000), "kilometres", None, "all agents: z1 in kilometres"),
@@ -106,6 +106,8 @@ SPOILT = [
     ("cv-2d", altered(2, BOTH, lambda z: z / 1000), "kilometres", 2, "agent 2: z1, z2 in kilometres"),
     ("cv-2d", altered(None, BOTH, lambda z: z / 1000), "kilometres", None, "all agents: z1, z2 in kilometres"),
     ("cv-2d", altered(3, BOTH, lambda z: -z), "sign", 3, "agent 3: z1, z2 of the wrong sign"),
+    ("cv-2d", altered(None, 0, lambda z: z + 40), "bias", None, r"all agents: a bias of z1 by (3[89]|4[012])\.?\d* m.*, or of the truth"),
+    ("cv-2d", of_truth(lambda x: x / 0.3048), "truth-feet", None, "the truth: in feet, not metres"),
     ("cv-2d", of_truth(lambda x: x / 1000), "truth-thousandth", None, "the truth: 1000 times too small"),
     ("thesis-steady", altered(2, 0, lambda z: z / 1000), "thousandth", 2, "agent 2: z1 1000 times too small"),
     ("thesis-steady", altered(1, 0, lambda z: z + 30), "bias", 1, r"agent 1: a bias of z1 by (2[89]|3[012])"),
