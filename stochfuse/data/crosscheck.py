@@ -161,7 +161,7 @@ def crosscheck(
             f"method {prediction.method} knows averages only: the {what} expected is sampled, {again.meta['runs']} "
             f"runs of estimator {whose}"
         )
-    verdict, judged = _judged(read, prediction, chosen, alpha, again)
+    verdict, judged = _compared(read, prediction, chosen, alpha, again)
     verdict = replace(verdict, notes=(*said, *verdict.notes))
     return replace(verdict, causes=causes_of(verdict, judged, rows)) if causes else verdict
 
@@ -252,10 +252,10 @@ def check_results(
     UsageError
         If the results do not fit the prediction.
     """
-    return _judged(results, prediction, metric, alpha, sampled)[0]
+    return _compared(results, prediction, metric, alpha, sampled)[0]
 
 
-def _judged(
+def _compared(
     results: SimulatorResults, prediction: Prediction, metric: Metric, alpha: float, sampled: Prediction | None
 ) -> tuple[Verdict, list[Judged]]:
     """The verdict, without causes, and its cells with the runs behind them."""

@@ -160,9 +160,7 @@ class Fits:
         C = self._of_runs[b] / np.sqrt(np.outer(each, each))
         still = np.diagonal(C) <= self._floor(b) ** 2
         C[still] = C[:, still] = 0.0
-        C[np.ix_(still, still)] = np.where(
-            np.outer(still, still)[np.ix_(still, still)], supposed[np.ix_(still, still)], 0
-        )
+        C[np.ix_(still, still)] = supposed[np.ix_(still, still)]
         return C
 
     @cached_property

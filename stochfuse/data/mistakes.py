@@ -190,25 +190,19 @@ def _measured_first(s: Simulator) -> Iterator[Variant]:
     if longer is None or s.shift:
         return
     system, d = longer.system, s.system.dimension
-    # the step that measures needs a sensor's H, which is never used at step 1 and may pause there
+
+    def early(M: np.ndarray) -> np.ndarray:
+        # the step that measures needs a sensor's H, which is never used at step 1 and may pause there
+        return np.concatenate([M[:1], M[2:3], M[2:]]) if len(M) > 2 else M
+
+    sensors = tuple(replace(x, H=early(x.H), R=early(x.R)) for x in system.sensors)
     F, Q, Bu = system.model.F.copy(), system.model.Q.copy(), system.model.Bu.copy()
     F[1], Q[1], Bu[1] = np.eye(d), 0.0, 0.0
-    sensors = tuple(
-        replace(
-            x,
-            H=np.concatenate([x.H[:1], x.H[2:3], x.H[2:]]) if len(x.H) > 2 else x.H,
-            R=np.concatenate([x.R[:1], x.R[2:3], x.R[2:]]) if len(x.R) > 2 else x.R,
-        )
-        for x in system.sensors
-    )
-    moved = replace(system, sensors=sensors, model=replace(system.model, F=F, Q=Q, Bu=Bu))
-    yield _certain(replace(longer, system=moved, shift=1))
+    models = [replace(system.model, F=F, Q=Q, Bu=Bu)]
     if len(system.model.F) > 2:
-        F, Q = system.model.F.copy(), system.model.Q.copy()
-        F[1], Q[1] = F[2], Q[2]
-        yield _certain(
-            replace(longer, system=replace(system, sensors=sensors, model=replace(system.model, F=F, Q=Q)), shift=1)
-        )
+        models.append(replace(system.model, F=early(system.model.F), Q=early(system.model.Q)))
+    for model in models:
+        yield _certain(replace(_system(longer, sensors=sensors, model=model), shift=1))
 
 
 def _start(s: Simulator, shared: bool) -> Iterator[Variant]:

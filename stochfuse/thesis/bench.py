@@ -42,7 +42,6 @@ LINKS = (0.0, 0.25, 0.5, 0.75, 1.0)
 ARCHITECTURES = ("ad-hoc", "broadcast", "cyclic")
 LIKE_NETWORKS = ARCHITECTURES[:2]
 """Networks that show nearly the same."""
-DATA = ("own", "start", "all")
 TRUTH = 1000.0
 """True state at step 1, the mean of the thesis' x(0)."""
 STATED_WINDOW, WINDOW = (6, 10), (6, 12)

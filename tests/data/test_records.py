@@ -72,7 +72,9 @@ def test_runs_are_sorted_and_told_apart():
     assert found.z[0][:, :, 0].tolist() == [[0, 2.0, 3.0], [0, 1.0, 0]]
     assert found.arrivals.heard == [[(1, 2, 4)] * 3, [(1, 2, 4), (3, 2, 4), (1, 2, 4)]]
     for names in (["²", "1"], ["--5", "1"]):  # digits, but no numbers
-        assert batch(scenario(), {"run": names, "step": [2, 2], "agent": [1, 1], "z1": [1.0, 2.0]})[0].names == tuple(names)
+        assert batch(scenario(), {"run": names, "step": [2, 2], "agent": [1, 1], "z1": [1.0, 2.0]})[0].names == tuple(
+            names
+        )
 
 
 def test_files_without_runs_hold_for_all():

@@ -189,7 +189,7 @@ def test_averages_over_noise_are_those_of_predict(bench, case, architecture):
     )
 
 
-@pytest.mark.parametrize("data", records.DATA)
+@pytest.mark.parametrize("data", about_records.READINGS)
 @pytest.mark.parametrize("rule", [LFG, SIMPLIFIED])
 def test_average_over_noise_is_that_of_many_records(bench, data, rule):
     scenario = bench.scenario(STEADY, "broadcast")
@@ -263,7 +263,7 @@ def test_process_noise_shrinks_the_rise(bench):
 
 def test_single_steady_records_seldom_rise_unless_data_are_shared(bench):
     seen = {}
-    for data in records.DATA:
+    for data in about_records.READINGS:
         found = time_average(about_records.given(Sweep(bench, STEADY, "broadcast"), data))
         seen[data] = np.mean(found[:, 1] > found[:, 0])
     # binomial standard errors of 2000 records are 0.004 and 0.009
@@ -279,8 +279,11 @@ def test_verdicts_follow_from_what_is_seen():
     assert explained(True, True, "1") == ("explained", "1")
     assert explained(True, False, "1") == ("agrees", "1")
     assert explained(False, True, "1") == ("differs", "1")
-    seen, none = {d: np.array([True, False]) for d in records.DATA}, {d: np.array([False]) for d in records.DATA}
-    averages = {d: np.array([1.0]) for d in records.DATA}
+    seen, none = (
+        {d: np.array([True, False]) for d in about_records.READINGS},
+        {d: np.array([False]) for d in about_records.READINGS},
+    )
+    averages = {d: np.array([1.0]) for d in about_records.READINGS}
     assert about_records.of_records(seen, averages, True)[0] == "agrees"
     assert about_records.of_records(seen, averages, False)[0] == "open"
     assert about_records.of_records(none, averages, False)[0] == "differs"
