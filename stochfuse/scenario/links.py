@@ -430,7 +430,10 @@ def _of_all(source: str, table: Mapping[str, Any], pair: np.ndarray, seq: np.nda
         pair, seq, got = key[:, 0], key[:, 1], arrived
     sent = np.bincount(pair, minlength=n * n).reshape(n, n)
     heard = np.bincount(pair, got, minlength=n * n).reshape(n, n).astype(int)
-    return _Packets(sent, heard, None if seq is None else (pair, seq, got), _repeated(again))
+    notes = _repeated(again)
+    if got.all():
+        notes += ("no packet of the log is lost; if it has those that arrived alone, leave out its column received",)
+    return _Packets(sent, heard, None if seq is None else (pair, seq, got), notes)
 
 
 def _of_received(pair: np.ndarray, seq: np.ndarray, n: int) -> _Packets:

@@ -124,6 +124,15 @@ def test_received_packets_alone_tell_what_was_sent_where_a_counter_wraps(tmp_pat
     assert any("each is counted once" in note for note in found.notes)
 
 
+def test_a_log_of_all_packets_without_a_loss_is_doubted(tmp_path):
+    rows = [f"{k},a,b,{int(k > 0)}\n" for k in range(4)]
+    for some, doubted in ((rows, False), (rows[1:], True)):
+        found = read_links(written(tmp_path, "seq,sender,receiver,received\n" + "".join(some)))
+        assert (
+            any("no packet of the log is lost; if it has those that arrived alone" in n for n in found.notes) == doubted
+        )
+
+
 def test_who_listened_and_heard_nothing_is_zero_and_who_never_listened_unknown(tmp_path):
     text = "seq,sender,receiver\n" + "".join(f"{k},a,b\n{k},b,c\n{k},c,b\n" for k in range(10))
     found = read_links(written(tmp_path, text))
