@@ -108,6 +108,13 @@ def run(
     truth: Annotated[
         str | None, option("True states: run, step, agent, states by name.", SCENARIO, metavar="FILE")
     ] = None,
+    estimates: Annotated[
+        str | None,
+        option(
+            "Of filters of your own, to be judged: run, step, agent, states by name, var:STATE, cov:STATE:STATE.",
+            SCENARIO, metavar="FILE",
+        ),
+    ] = None,
     initial: Annotated[
         str | None,
         option(
@@ -148,9 +155,9 @@ def run(
     names = None if estimator is None else named(estimator)
     if scenario == ROBOTS:
         others = {
-            "measurements": measurements, "arrivals": arrivals, "truth": truth, "initial": initial, "columns": columns,
-            "output": output, "criterion": None if criterion == "det" else criterion, "covariance": covariance or None,
-            **changes._replace(link=None)._asdict(),
+            "measurements": measurements, "arrivals": arrivals, "truth": truth, "estimates": estimates,
+            "initial": initial, "columns": columns, "output": output, "criterion": None if criterion == "det" else criterion,
+            "covariance": covariance or None, **changes._replace(link=None)._asdict(),
         }  # fmt: skip
         check_robots(robots, others, metric)
         check_files(None, plot)
@@ -160,7 +167,7 @@ def run(
         raise UsageError(f"--data, --landmarks, --until, --runs, --white: expected with {ROBOTS} alone, got {scenario}")
     if measurements is None:
         raise UsageError("--measurements: expected a file of measurements, got none")
-    files = [file for file in (measurements, arrivals, truth, initial) if file is not None]
+    files = [file for file in (measurements, arrivals, truth, estimates, initial) if file is not None]
     if [*files, scenario].count("-") > 1:
         raise UsageError("expected at most one file on standard input, got - for several")
     check_estimates(output)
@@ -168,7 +175,8 @@ def run(
     page.check(output, plot, scenario, *files)
     given, links = changes.of(scenario)
     first = initial or beside(measurements)
-    records = read_records(given, measurements, arrivals, truth, first, pairs("--columns", columns))
+    theirs = pairs("--columns", columns)
+    records = read_records(given, measurements, arrivals, truth, first, theirs, estimates)
     chosen = metric_of(metric or given.metric or "trace", given.model)
     way = Way(names or (given.estimator or LFG,), one_link(links, case), seed, criterion)
     writing: Any = nullcontext()

@@ -6,6 +6,8 @@
                    sender, receiver, received (optional), one packet a step
     truth          run (optional), step, some or all states by name; agent (optional), where each has its own
     first          run (optional), agent, the states by name: first estimates, default initial.x of the scenario
+    estimates      run (optional), step, agent, the states by name, var:state of each and cov:state:state of each pair:
+                   what filters of one's own made of it
 
 Agents go by name or by number from 1, steps count from 1.  Rows come in any order.  A file without runs holds for all
 runs of the others.  A measurement that is not there (no row, or empty cells) was missed: its agent predicts only.  The
@@ -27,9 +29,12 @@ from stochfuse.data.columns import TEXT, WHOLE, ColumnField, Columns, ColumnsErr
 from stochfuse.engines.replay import ArrivalRecord
 from stochfuse.errors import StochfuseError, UsageError, nearest
 from stochfuse.estimators.protocol import Late
+from stochfuse.kalman.packed import sound, triangle
 from stochfuse.scenario.network import reachable
 from stochfuse.scenario.scenario import Scenario, load_scenario
 
+ColumnNames = Mapping[str, str | Sequence[str]]
+"""Names that files have for columns, by ours; several where files differ."""
 RUN, STEP = ColumnField("run", TEXT, required=False), ColumnField("step", WHOLE, 1)
 ALONE = ("1",)
 """Names of the runs where no file has any."""
@@ -77,6 +82,8 @@ class RecordedRuns(NamedTuple):
     missed : (runs, steps, agents) whether a sensor that is there measured nothing.
     truth : (runs, steps, agents, d), NaN where unknown; None where it is not given.
     first : by agent, (runs, d, 1) first estimates; empty where they are the scenario's.
+    estimates : x (runs, steps, agents, d) and P (runs, steps, agents, d, d), NaN where there are none; None where they
+        are not given.
     """
 
     runs: np.ndarray
@@ -86,6 +93,7 @@ class RecordedRuns(NamedTuple):
     missed: np.ndarray
     truth: np.ndarray | None
     first: tuple[np.ndarray, ...]
+    estimates: tuple[np.ndarray, np.ndarray] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +104,7 @@ class Records:
     ----------
     scenario : with as many steps as the records have.
     names : of the runs.
-    measurements, relations, arrivals, truth, first : tables, None where they are not given.
+    measurements, relations, arrivals, truth, first, estimates : tables, None where they are not given.
     known : (states,) which states the truth gives.
     notes : what should be known of how the files were read.
     """
@@ -110,6 +118,7 @@ class Records:
     first: RunRows | None
     known: np.ndarray
     notes: tuple[str, ...]
+    estimates: RunRows | None = None
 
     @property
     def given(self) -> bool:
@@ -167,6 +176,7 @@ class Records:
             missed,
             None if self.truth is None else _placed(self.truth.of(runs), (count, steps, n, d), self.known),
             self._first_estimates(runs),
+            None if self.estimates is None else _estimates(self.estimates.of(runs), (count, steps, n, d)),
         )
 
     def _first_estimates(self, runs: slice) -> tuple[np.ndarray, ...]:
@@ -213,6 +223,20 @@ def _first(rows: tuple[np.ndarray, np.ndarray, np.ndarray], count: int, n: int, 
     return out
 
 
+def _estimates(
+    rows: tuple[np.ndarray, np.ndarray, np.ndarray], shape: tuple[int, int, int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    run, where, values = rows
+    d = shape[-1]
+    x, P = np.full(shape, np.nan), np.full((*shape, d), np.nan)
+    place = (run, where[:, 0], where[:, 1])
+    x[place] = values[:, :d]
+    i, j, _ = triangle(d)
+    for entry, of in enumerate(values[:, d:].T):
+        P[(*place, i[entry], j[entry])] = P[(*place, j[entry], i[entry])] = of
+    return x, P
+
+
 def _arrivals(rows: tuple[np.ndarray, np.ndarray, np.ndarray], missed: np.ndarray) -> ArrivalRecord:
     run, where, _ = rows
     step, receiver, sender, sent = where.T
@@ -253,27 +277,29 @@ def read_records(
     arrivals: Any = None,
     truth: Any = None,
     first: Any = None,
-    columns: Mapping[str, str] | None = None,
+    columns: ColumnNames | None = None,
+    estimates: Any = None,
 ) -> Records:
     """Read the records of some runs.
 
     Parameters
     ----------
-    measurements, arrivals, truth, first : paths of CSV, Parquet or JSON files, or frames or mappings of arrays; see the
-        module.
-    columns : names that the files have for columns, by the names here.
+    measurements, arrivals, truth, first, estimates : paths of CSV, Parquet or JSON files, or frames or mappings of
+        arrays; see the module.
+    columns : names that the files have for columns, by the names here; several where files differ.
 
     Raises
     ------
     UsageError
         If a file is malformed or does not fit the scenario; names line and column.
     """
-    read = _ScenarioReader(scenario, dict(columns or {}))
+    read = _ScenarioReader(scenario, columns or {})
     tables = {
         "measurements": read.measurements(measurements),
         "arrivals": None if arrivals is None else read.arrivals(arrivals),
         "truth": None if truth is None else read.truth(truth),
         "first": None if first is None else read.first(first),
+        "estimates": None if estimates is None else read.estimates(estimates),
     }
     read.check_columns()
     given = {name: table for name, table in tables.items() if table is not None}
@@ -295,6 +321,7 @@ def read_records(
         rows.get("first"),
         read.known,
         tuple(notes),
+        rows.get("estimates"),
     )
 
 
@@ -390,8 +417,13 @@ class _RawTable(NamedTuple):
 class _ScenarioReader:
     """Reads the files of a scenario; knows its agents and states."""
 
-    def __init__(self, scenario: Scenario, renamed: dict[str, str]) -> None:
-        self.scenario, self.renamed = scenario, renamed
+    def __init__(self, scenario: Scenario, renamed: ColumnNames) -> None:
+        self.scenario = scenario
+        self.renamed = [
+            (ours, each)
+            for ours, theirs in renamed.items()
+            for each in ([theirs] if isinstance(theirs, str) else theirs)
+        ]
         self.used: set[str] = set()
         self.seen: dict[str, None] = {}
         self.known = np.arange(scenario.model.dimension)
@@ -413,7 +445,7 @@ class _ScenarioReader:
     def _renamed_in(self, names: Sequence[str], fields: Callable[[Sequence[str]], list[ColumnField]]) -> dict[str, str]:
         """Those of the given names that a file has, of columns that are wanted of it."""
         self.seen.update(dict.fromkeys(names))
-        here = {ours: theirs for ours, theirs in self.renamed.items() if theirs in names}
+        here = {ours: theirs for ours, theirs in self.renamed if theirs in names}
         if not here:
             return {}
         wanted = {field.name for field in fields([*here, *names])}
@@ -421,7 +453,7 @@ class _ScenarioReader:
 
     def check_columns(self) -> None:
         """Raise UsageError if a name was given for a column that no file has."""
-        for ours, theirs in self.renamed.items():
+        for ours, theirs in self.renamed:
             if ours not in self.used:
                 raise UsageError(f"columns: unknown column '{ours}'{nearest(ours, sorted(self.used))}")
             if theirs not in self.seen:
@@ -561,6 +593,28 @@ class _ScenarioReader:
                 f"{found.source}: expected a first estimate of every agent, got none of agent {lost + 1}{where}"
             )
         where = np.stack([np.zeros_like(agent), agent], axis=1)
+        return self._once(found, where, values, [], np.ones(len(found), dtype=bool))
+
+    def estimates(self, source: Any) -> _RawTable:
+        """What filters of one's own estimate and claim: keys step, agent; states, then the upper triangle of P."""
+        states = self.scenario.model.states
+        i, j, _ = triangle(len(states))
+        pairs = list(zip(i.tolist(), j.tolist(), strict=True))
+
+        def called(i: int, j: int) -> str:
+            return f"var:{states[i]}" if i == j else f"cov:{states[i]}:{states[j]}"
+
+        def fields(names: Sequence[str]) -> list[ColumnField]:
+            claimed = [called(j, i) if called(j, i) in names else called(i, j) for i, j in pairs]
+            return [RUN, STEP, ColumnField("agent", TEXT), *map(ColumnField, (*states, *claimed))]
+
+        found = self.columns(source, fields)
+        shown = [*states, *(called(i, j) if called(i, j) in found else called(j, i) for i, j in pairs)]
+        values = np.stack([found.number[name] for name in shown], axis=1)
+        self._check_size(found, values, shown, "a number")
+        unsound = ~sound(values[:, len(states) :].T, len(states))
+        found.refuse(unsound, shown[len(states)], "variances and covariances of a matrix that is one")
+        where = np.stack([found.number["step"] - 1, self._agent(found, "agent")], axis=1)
         return self._once(found, where, values, [], np.ones(len(found), dtype=bool))
 
     def _width(self, agent: int) -> int:

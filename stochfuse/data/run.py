@@ -22,12 +22,13 @@ import numpy as np
 
 from stochfuse.data.consistency import Average, Series, band
 from stochfuse.data.draw import Draws, drawn_arrivals
-from stochfuse.data.records import RecordedRuns, Records, read_records
+from stochfuse.data.records import ColumnNames, RecordedRuns, Records, read_records
 from stochfuse.data.suspicions import Suspicion, suspicions
 from stochfuse.engines.progress import listener
 from stochfuse.engines.replay import ArrivalRecord, Stage, moments_given, replay
 from stochfuse.errors import StochfuseError, UsageError, nearest
 from stochfuse.estimators.readings import Readings
+from stochfuse.kalman.kernel import Estimate
 from stochfuse.kalman.metrics import Metric
 from stochfuse.kalman.metrics import metric as metric_of
 from stochfuse.prediction.predict import choose, predict
@@ -45,6 +46,8 @@ FOLLOWED = 2_000_000
 """Runs times agents times steps squared of which the error given what arrived is worked out: so does its work grow."""
 
 
+RECORDED = "recorded"
+"""What estimates are called that come with the records."""
 RecordsLike = Records | Draws
 """Records of some runs, read or drawn."""
 
@@ -220,7 +223,7 @@ def run(
     truth: Any = None,
     *,
     initial: Any = None,
-    columns: Mapping[str, str] | None = None,
+    columns: ColumnNames | None = None,
     metric: str | None = None,
     **way: Any,
 ) -> RunResult:
@@ -231,10 +234,11 @@ def run(
     scenario : what the estimators are told; it is lengthened to the records' last step.
     measurements, arrivals, truth, initial : files, mappings of arrays or data frames, see `stochfuse.data.records`;
         arrivals that are not given are drawn from the links.
-    columns : names that they have for columns, by the names here.
+    columns : names that they have for columns, by the names here; several where files differ.
     metric : what errors are shown in; default: the scenario's, else trace.
-    **way : estimator (a name or several; default: the scenario's, else local-fusion-graph), link, seed, criterion,
-        predicted (False: predict nothing), suspected (False: look for no faults), see `Way`.
+    **way : estimates (what filters of one's own made of it, judged beside the estimators as "recorded"); estimator (a
+        name or several; default: the scenario's, else local-fusion-graph), link, seed, criterion, predicted (False:
+        predict nothing), suspected (False: look for no faults), see `Way`.
 
     Returns
     -------
@@ -255,8 +259,9 @@ def run(
     >>> found.rows[0].estimator, found.rows[0].agent, found.rows[0].realised
     ('naive', None, None)
     """
+    estimates = way.pop("estimates", None)
     how = way_of(way, scenario)
-    records = read_records(scenario, measurements, arrivals, truth, initial, columns)
+    records = read_records(scenario, measurements, arrivals, truth, initial, columns, estimates)
     return run_records(records, metric_of(metric or scenario.metric or "trace", scenario.model), how)
 
 
@@ -289,7 +294,9 @@ def run_records(
             "arrivals are drawn from the scenario's links: expected one link probability; give --link or --arrivals"
         )
     tallies = {name: Tally(records, name, way.criterion) for name in way.estimators}
-    done, total = 0, len(records.names) * len(way.estimators) * scenario.network.steps
+    if isinstance(records, Records) and records.estimates is not None:
+        tallies[RECORDED] = RecordedTally(records, RECORDED, way.criterion)
+    done, total = 0, len(records.names) * len(tallies) * scenario.network.steps
     heard, measured, suspected = None, (), ()
     for batch in records.batches():
         arrivals = batch.arrivals
@@ -299,11 +306,13 @@ def run_records(
             heard, measured = _heard(arrivals), tuple(z[0] for z in batch.z)
             suspected = suspicions(scenario, batch, records.known) if way.suspected else ()
         for tally in tallies.values():
-            tally.add(batch, arrivals, write, (done, total))
+            tally.add(batch, arrivals, write if tally.estimator != RECORDED else None, (done, total))
             done += len(batch.runs) * scenario.network.steps
     rows, notes = [], list(records.notes)
     for tally in tallies.values():
-        expected = _expected(scenario, links, tally.estimator, way) if way.predicted else PredictedSquare(None, "", ())
+        expected = PredictedSquare(None, "", ())
+        if way.predicted and tally.estimator != RECORDED:
+            expected = _expected(scenario, links, tally.estimator, way)
         notes += [*expected.notes, *tally.notes]
         rows += tally.rows(metric, expected, _link(links))
     if heard is None:
@@ -379,7 +388,7 @@ class Tally:
         nees, nis = np.full(shape, np.nan), np.full(shape, np.nan)
         names = [self.records.names[run] for run in batch.runs.tolist()]
         first = not self._shown
-        for stage in stages(self.records, batch, arrivals, self.estimator, self.criterion):
+        for stage in self.stages(batch, arrivals):
             k = stage.step - 1
             listener().advance("running estimators", work[0] + stage.step * len(batch.runs), work[1])
             x = np.stack([estimate.x[..., 0] for estimate in stage.estimates], axis=1)
@@ -392,8 +401,8 @@ class Tally:
                 there = ~np.isnan(squared)
                 self._square[k] += np.einsum("rai,raj->aij", *(np.where(there[..., None], error, 0.0),) * 2)
             else:
-                there = np.ones(x.shape[:2], dtype=bool)
-            self._claim[k] += np.einsum("ra,raij->aij", there, P)
+                there = ~np.asarray(np.isnan(x).any(axis=-1))
+            self._claim[k] += np.where(there[..., None, None], P, 0.0).sum(axis=0)
             self._count[k] += there.sum(axis=0)
             if first:
                 self._shown.append(np.stack([x[0], np.diagonal(P[0], axis1=-2, axis2=-1)]))
@@ -405,6 +414,10 @@ class Tally:
         self.nees.add(nees)
         self.nis.add(nis)
         self._add_given(arrivals)
+
+    def stages(self, batch: RecordedRuns, arrivals: ArrivalRecord) -> Iterator[Stage]:
+        """What is claimed, step by step."""
+        return stages(self.records, batch, arrivals, self.estimator, self.criterion)
 
     def _add_given(self, arrivals: ArrivalRecord) -> None:
         """Expected squared error given what arrived, of as many runs as can be followed."""
@@ -467,6 +480,21 @@ class Tally:
         x, variance = np.stack(self._shown, axis=1)
         nees, nis = _over_steps(self.nees), _over_steps(self.nis)
         return Trace(self.estimator, x, variance, self._truth, *nees, *nis)
+
+
+class RecordedTally(Tally):
+    """The same of estimates that come with the records."""
+
+    def stages(self, batch: RecordedRuns, arrivals: ArrivalRecord) -> Iterator[Stage]:
+        """What was written down, step by step; NaN where nothing was."""
+        x, P = batch.estimates  # type: ignore[misc]
+        unknown = np.full(x.shape[:3], np.nan)
+        for k in range(x.shape[1]):
+            claimed = tuple(Estimate(x[:, k, i, :, None], P[:, k, i]) for i in range(x.shape[2]))
+            yield Stage(k + 1, claimed, unknown[:, k], np.zeros(x.shape[2]))
+
+    def _add_given(self, arrivals: ArrivalRecord) -> None:
+        """Nothing is known of a rule that is not ours."""
 
 
 def _over_steps(series: Series) -> tuple[np.ndarray, np.ndarray]:

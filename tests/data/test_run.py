@@ -87,6 +87,8 @@ OTHERS = [
     ({"arrivals": Z}, r"column 'receiver' is missing from run, step, agent, z1"),
     ({"arrivals": "step,receiver,sender\n2,1,1\n"}, r"column 'receiver': expected another agent than the sender"),
     ({"arrivals": "step,receiver,sender,sent_step\n2,1,2,3\n"}, r"column 'sent_step': expected a step up to 2, got 3"),
+    ({"estimates": "step,agent,x\n2,1,0\n"}, r"column 'var:x' is missing from step, agent, x"),
+    ({"estimates": "step,agent,x,var:x\n2,1,0,-1\n"}, r"line 2, column 'var:x': expected variances and cov.* got -1"),
     ({"initial": "agent,x\n1,0\n2,0\n"}, r"expected a first estimate of every agent, got none of agent 3"),
     ({"initial": "run,agent,x\n1,1,0\n1,2,0\n1,3,0\n2,1,0\n"}, r"got none of agent 2 in run '2'"),
 ]
@@ -242,6 +244,30 @@ def test_rows_are_what_estimates_and_truth_come_to(estimator, made, tmp_path):
         assert row["nees"] == pytest.approx(nees, rel=1e-8)
     assert rows[None]["realised"] == pytest.approx(np.sqrt(np.mean([h[0] ** 2 for h in hand.values()])), rel=1e-10)
     assert rows[None]["nees"] == pytest.approx(np.mean([h[2] for h in hand.values()]), rel=1e-8)
+
+
+def test_estimates_of_ones_own_are_judged_as_ours_are(made, tmp_path):
+    """What a run wrote, read back under other names: the same errors, claims and NEES, also of some rows alone."""
+    own = tmp_path / "own.csv"
+    command("run", "cv-2d", *files_of(made), "--estimator", "naive", "--covariance", "--output", own)
+    header, *lines = own.read_text().splitlines(keepends=True)
+    names = {"x": "x_hat", "cov:x:y": "P_xy"}
+    header = ",".join(names.get(name, name) for name in header.split(","))
+    given = [f"{ours}={theirs}" for ours, theirs in names.items()]
+    for kept in (lines, lines[::2]):
+        own.write_text(header + "".join(kept))
+        words = ["--estimates", own, "--columns", ",".join(given), "--estimator", "naive", "--format", "json"]
+        rows = strict_json(command("run", "cv-2d", *files_of(made), *words).stdout)["rows"]
+        theirs = [row for row in rows if row["estimator"] == "recorded"]
+        if kept is lines:
+            for row, ours in zip(theirs, rows, strict=False):
+                for key in ("realised", "claimed", "nees", "nees_low", "nees_high"):
+                    assert row[key] == pytest.approx(ours[key], rel=1e-9)
+        back = tmp_path / "back.csv"
+        back.write_text(own.read_text().replace("x_hat", "x").replace("P_xy", "cov:x:y"))
+        for agent, (_, _, nees) in by_hand(made, back, ["x", "y"]).items():
+            assert theirs[int(agent)]["nees"] == pytest.approx(nees, rel=1e-8)
+        assert [row["predicted"] for row in theirs] == [None] * 4
 
 
 def test_json_has_the_keys_of_its_schema(made):
