@@ -156,8 +156,8 @@ def run(
     if scenario == ROBOTS:
         others = {
             "measurements": measurements, "arrivals": arrivals, "truth": truth, "estimates": estimates,
-            "initial": initial, "columns": columns, "output": output, "criterion": None if criterion == "det" else criterion,
-            "covariance": covariance or None, **changes._replace(link=None)._asdict(),
+            "initial": initial, "columns": columns, "output": output, "covariance": covariance or None,
+            "criterion": None if criterion == "det" else criterion, **changes._replace(link=None)._asdict(),
         }  # fmt: skip
         check_robots(robots, others, metric)
         check_files(None, plot)
