@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import sympy
 
-from stochfuse import __version__
+from stochfuse.report.table import stamped
 from stochfuse.scenario.registry import CLAIMED, GENERAL, LFG, NAIVE, OPTIMAL, RMS, SIMPLIFIED
 from stochfuse.symbolic.general import GeneralForm
 from stochfuse.symbolic.simplified import FIXED, MOST_AGENTS_CLEARED, MU, SimplifiedForm
@@ -171,15 +171,10 @@ def to_latex(made: Derivation) -> str:
 
 def to_mapping(made: Derivation) -> dict[str, Any]:
     """Return an object of texts that SymPy can read back."""
-    return {
-        "schema": SCHEMA,
-        "version": __version__,
-        **made.facts,
-        "description": made.title,
-        "formulas": [
-            {"key": f.key, "says": f.says, "name": str(f.name), "expression": str(f.expression)} for f in made.formulas
-        ],
-    }
+    formulas = [
+        {"key": f.key, "says": f.says, "name": str(f.name), "expression": str(f.expression)} for f in made.formulas
+    ]
+    return stamped(SCHEMA, **made.facts, description=made.title, formulas=formulas)
 
 
 def _latex_names(step: int) -> dict[str, str]:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.report.plot import below, figure_class, titled
+from stochfuse.report.plot import below, canvas, entry, titled
 from stochfuse.scenario.links import Links
 
 LEAST = 0.01
@@ -62,7 +62,7 @@ def draw_network(found: Links, steps: Sequence[int]) -> Any:
     panels = list(_panels(found, steps))[:MOST_PANELS]
     low, high = _limits(found)
     across, down, size = _layout(len(panels), high - low)
-    figure = figure_class()(figsize=size, layout="compressed")
+    figure = canvas(*size, layout="compressed")
     grid = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
     for axes, panel in zip(grid.flat, panels, strict=False):
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
@@ -137,9 +137,7 @@ def _says(found: Links) -> list[str]:
 
 
 def _legend(found: Links) -> list[Any]:
-    from matplotlib.lines import Line2D
-
-    return [Line2D([], [], **_ink(µ), label=f"µ = {µ:g}") for µ in (1.0, 0.75, 0.5, 0.25, 0.05)]
+    return [entry(f"µ = {µ:g}", **_ink(µ)) for µ in (1.0, 0.75, 0.5, 0.25, 0.05)]
 
 
 def _ink(µ: float) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from stochfuse.data.protocols import ProtocolLoad
 from stochfuse.prediction.result import Prediction
 from stochfuse.prediction.swept import Swept
 from stochfuse.questions.messages import Load, SweptLoad
+from stochfuse.report.plot import entry, shades, spread
 from stochfuse.scenario.over import LINK, Over
 
 Cells = tuple[Any, ...]
@@ -209,6 +210,25 @@ class Curves(NamedTuple):
     what: str
     whole: bool = False
     at: str = ""
+
+    def shown(self) -> list[ShownCurve]:
+        """Return those that are drawn, at most eight from first to last."""
+        chosen = spread(len(self.names))
+        each = zip(chosen, shades(len(chosen)), strict=True)
+        return [ShownCurve(self.names[c], self.x[c], self.picks[c], color) for c, color in each]
+
+    def entries(self) -> list[Any]:
+        """Return what a legend says of their colours."""
+        return [entry(curve.name, color=curve.color, linewidth=3) for curve in self.shown()]
+
+
+class ShownCurve(NamedTuple):
+    """A curve that is drawn: its name, its x, the index of its values, and its colour."""
+
+    name: str
+    x: np.ndarray
+    pick: Any
+    color: Any
 
 
 def _by_step(x: np.ndarray, rows: np.ndarray, steps: np.ndarray | None, label: str, *, whole: bool = False) -> Curves:
