@@ -11,22 +11,17 @@ from stochfuse.cli.options import (
     WORK,
     AgentOption,
     AtOption,
+    Averaging,
     Changes,
-    Graphs,
     MetricOption,
     OverOption,
-    Precisely,
     Reported,
-    Sampling,
     ScenarioArgument,
-    Weighing,
-    Written,
-    check_memory,
     completed,
     named,
     option,
     quantity_names,
-    settings_for,
+    refuse,
     steps_at,
     tell,
     whose,
@@ -86,12 +81,8 @@ def compare(
     at: AtOption = None,
     all_steps: Annotated[bool, option("Estimators: every step, not only the last.", SHOWN, "--all-steps")] = False,
     relative: Annotated[bool, option("Differences in per cent of the reference.", SHOWN, "--relative")] = False,
-    sampling: Sampling = Sampling(),
-    precisely: Precisely = Precisely(),
-    graphs: Graphs = Graphs(),
-    weighing: Weighing = Weighing(),
-    to: Written = Written(),
-    page: Reported = Reported(),
+    averaging: Averaging = Averaging(),
+    to: Reported = Reported(),
 ) -> None:
     """Show what methods predict side by side, and the signed differences; or what estimators claim and achieve.
 
@@ -102,32 +93,22 @@ def compare(
     from stochfuse.prediction.method import ShownPart
 
     to.check(scenario)
-    page.check(to.output, to.plot, scenario)
-    given, links = changes.of(scenario)
-    swept = changes.over(over, given)
-    given = swept.longest if swept else given
-    check_memory(given, links, to.kind, len(swept.points) if swept else 1)
+    given, links, swept = changes.swept(scenario, over, to.kind)
     names = None if estimator is None else [ALL] if estimator == ALL else list(named(estimator))
     if names is None and methods is None and given.estimator is not None:
         names = [ALL]  # a scenario for other estimators than those of the thesis' methods
     several = names is not None and (len(names) > 1 or methods is None or names == [ALL])
-    ways = list(DEFAULT) if methods is None else _names(methods)
+    ways = list(DEFAULT) if methods is None else [name.strip() for name in methods.split(",")]
     if several and methods is not None and len(ways) > 1:
         raise UsageError(f"--methods: expected one with several estimators, got {methods}")
-    criterion = weighing.criterion
-    settings = settings_for(
+    settings = averaging.settings(
         [GENERAL, MONTE_CARLO] if several and methods is None else ways,
         estimator=None if several or names is None else names[0],
-        **sampling._asdict(),
-        **precisely._asdict(),
-        **graphs._asdict(),
-        **weighing._asdict(),
     )
     settings |= {} if swept is None else {"over": swept}
-    for flag, given_at_all in (("--reference", reference is not None), ("--relative", relative)):
-        if several and given_at_all:
-            raise UsageError(f"{flag}: expected methods to compare, got several estimators")
-    if criterion is not None and several and names != [ALL] and not set(names or ()) & set(INTERSECTIONS):
+    if several:
+        refuse({"--reference": reference, "--relative": relative}, "methods to compare, got several estimators")
+    if averaging.criterion is not None and several and names != [ALL] and not set(names or ()) & set(INTERSECTIONS):
         raise UsageError(f"--criterion: expected estimator {' or '.join(INTERSECTIONS)}, got {estimator}")
     if all_steps and not several:
         raise UsageError("--all-steps: expected several estimators")
@@ -135,7 +116,7 @@ def compare(
     chosen, chosen_agent = metric_of(metric or given.metric or "trace", given.model), whose(agent, given)
     steps = steps_at(at, given)
     settings["shown"] = ShownPart(tuple(quantities), (chosen,), chosen_agent, steps)
-    shown = _Display(chosen, chosen_agent, steps, to, page)
+    shown = _Display(chosen, chosen_agent, steps, to)
     if several:
         only = None if names == [ALL] else names
         _estimators(shown, given, links, only, None if methods is None else ways[0], quantities, all_steps, settings)
@@ -145,23 +126,18 @@ def compare(
         _methods(shown, given, links, ways, reference, quantities[0], relative, settings)
 
 
-def _names(text: str) -> list[str]:
-    return [name.strip() for name in text.split(",")]
-
-
 class _Display(NamedTuple):
     """How an answer is shown."""
 
     metric: Metric
     agent: int | str
     steps: tuple[int, ...] | None
-    to: Written
-    page: Reported
+    to: Reported
 
     def write(self, report: Report, scenario: Scenario, said: Sequence[str]) -> None:
         """Write the answer, and the page."""
         self.to.write(report)
-        self.page.write(report, scenario.to_mapping(), said)
+        self.to.send(report, scenario.to_mapping(), said)
 
 
 def _methods(
@@ -200,12 +176,12 @@ def _estimators(
 ) -> None:
     from stochfuse.prediction.compare import compare_estimators as run
     from stochfuse.prediction.quantities import check
-    from stochfuse.report import comparisons as estimators
+    from stochfuse.report.comparisons import EstimatorView, estimator_report
 
     for name in quantities:
         check(name, how.metric)
     found = run(scenario, links, names, method, quantities=quantities, **settings)
-    view = estimators.EstimatorView(found, how.metric, how.agent, how.to.digits, quantities, all_steps, how.steps)
+    view = EstimatorView(found, how.metric, how.agent, how.to.digits, quantities, all_steps, how.steps)
     said = [f"note: left out: {reason}" for reason in found.left_out]
     said += [f"note: {prediction.estimator}: {note}" for prediction in found.predictions for note in prediction.notes]
     warnings = {views[0].prediction.estimator: views[0].overconfidence() for views in view.views}
@@ -214,4 +190,4 @@ def _estimators(
         said.append(f"warning: overconfident by more than 5 % somewhere: {', '.join(warnings)}")
     else:
         said += [f"warning: {name}: {warning}" for name, warning in warnings.items()]
-    how.write(estimators.estimator_report(view), scenario, tell(said))
+    how.write(estimator_report(view), scenario, tell(said))

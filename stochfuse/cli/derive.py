@@ -8,11 +8,11 @@ from typing import Annotated
 import typer
 
 from stochfuse.cli.options import (
+    ARCHITECTURE,
     NETWORK,
     OUTPUT,
     SCENARIO,
     SHOWN,
-    ArchitectureName,
     OutputOption,
     choice,
     completed,
@@ -45,7 +45,7 @@ def derive(
     ] = SIMPLIFIED,
     agents: Annotated[int, option("Number of like agents; default: 3.", NETWORK, min=1, metavar="N")] = 3,
     step: Annotated[int, option("The step whose covariance is derived; default: 2.", NETWORK, min=1, metavar="K")] = 2,
-    architecture: ArchitectureName = "ad-hoc",
+    architecture: Annotated[str, ARCHITECTURE] = "ad-hoc",
     q: Number = None,
     r: Number = None,
     p0: Number = None,

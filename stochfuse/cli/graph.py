@@ -47,7 +47,7 @@ def graph(
     from stochfuse.report.plot import save
     from stochfuse.report.table import terminal_width, to_json, write_text
 
-    check_files(output, plot, history, scenario or "")
+    check_files([history, scenario], output, plot)
     made = FusionGraph(load_history(history), shared=shared)
     agents = range(1, made.history.agents + 1) if agent is None else [agent]
     steps = range(1, made.history.steps + 1) if step is None else [step]

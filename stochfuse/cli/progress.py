@@ -26,7 +26,7 @@ class ProgressThread(Progress):
     """A thread that shows what the work last said."""
 
     def __init__(self) -> None:
-        self._last = ("working", 0, 0)
+        self.silence, self._last = 0.0, ("working", 0, 0)
         self._over = threading.Event()
         self._start = time.monotonic()
         self._thread = threading.Thread(target=self._bar if _terminal() else self._lines, daemon=True)
@@ -53,11 +53,18 @@ class ProgressThread(Progress):
         if self._over.wait(PATIENCE):
             return
         from rich.console import Console
-        from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
         from rich.progress import Progress as Bar
 
-        columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-        with Bar(*columns, console=Console(stderr=True), transient=True, redirect_stdout=False) as bar:
+        texts = SpinnerColumn(), TextColumn("{task.description}"), BarColumn()
+        with Bar(
+            *texts,
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+            transient=True,
+            redirect_stdout=False,
+        ) as bar:
             task = bar.add_task("working", total=None)
             while not self._over.wait(0.2):
                 what, done, total = self._last
@@ -71,7 +78,8 @@ class ProgressThread(Progress):
                 return
             what, done, total = self._last
             share = f", {done:,} of {total:,}" if total else ""
-            typer.echo(f"note: {what}{share}; {due:.0f} s so far", err=True)
+            if due >= self.silence:
+                typer.echo(f"note: {what}{share}; {due:.0f} s so far", err=True)
             said += 1
 
 
@@ -91,6 +99,12 @@ def shown() -> Iterator[None]:
             yield
     finally:
         _now.pop().stop()
+
+
+def patient(seconds: float) -> None:
+    """Write no line before so many seconds have passed."""
+    for progress in _now:
+        progress.silence = seconds
 
 
 def quiet() -> None:

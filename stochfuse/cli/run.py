@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,23 +16,17 @@ from stochfuse.cli.options import (
     RARE,
     SCENARIO,
     WORK,
+    Beside,
     Changes,
-    DigitsOption,
-    FormatOption,
     MetricOption,
-    PlotOption,
-    Reported,
     ScenarioArgument,
-    Written,
-    check_files,
-    chosen_format,
     completed,
     named,
     option,
-    pairs,
     parse_link,
+    refuse,
+    renamed,
     tell,
-    write_report,
 )
 from stochfuse.errors import UsageError
 from stochfuse.scenario.registry import CRITERIA, ESTIMATORS, LFG
@@ -69,7 +64,8 @@ ROBOTS = "utias"
 """What stands for a scenario where robots' records are run."""
 
 
-class RobotOptions(NamedTuple):
+@dataclass(frozen=True)
+class RobotOptions:
     """A record of robots that see landmarks and one another."""
 
     data: Annotated[
@@ -91,6 +87,25 @@ class RobotOptions(NamedTuple):
     white: Annotated[bool, option(f"{ROBOTS}: take what was identified for white noise.", WORK + RARE, "--white")] = (
         False
     )
+
+
+@dataclass(frozen=True)
+class Estimates(Beside):
+    """A report on standard output, and the estimates in a file."""
+
+    output: Annotated[
+        Path | None, option("Write the estimates there: .csv or .parquet.", OUTPUT, "--output", "-o", metavar="FILE")
+    ] = None
+    covariance: Annotated[bool, option("Write covariances too, cov:STATE:STATE.", OUTPUT + RARE, "--covariance")] = (
+        False
+    )
+
+    def check(self, *inputs: str | None) -> None:
+        """See `Listed.check`."""
+        from stochfuse.report.table import check_writable
+
+        check_writable(self.output, (".csv", ".parquet"))
+        super().check(*inputs)
 
 
 def run(
@@ -125,16 +140,7 @@ def run(
     estimator: EstimatorsOption = None,
     criterion: CriterionOption = "det",
     metric: MetricOption = None,
-    covariance: Annotated[
-        bool, option("Write covariances too, cov:STATE:STATE.", OUTPUT + RARE, "--covariance")
-    ] = False,
-    format: FormatOption = None,
-    output: Annotated[
-        Path | None, option("Write the estimates there: .csv or .parquet.", OUTPUT, "--output", "-o", metavar="FILE")
-    ] = None,
-    plot: PlotOption = None,
-    digits: DigitsOption = 5,
-    page: Reported = Reported(),
+    to: Estimates = Estimates(),
 ) -> None:  # fmt: skip
     """Run estimators on measurements; show realised, claimed and predicted errors, and whether claims are consistent.
 
@@ -149,12 +155,12 @@ def run(
     if scenario == ROBOTS:
         others = {
             "measurements": measurements, "arrivals": arrivals, "truth": truth, "initial": initial, "columns": columns,
-            "output": output, "criterion": None if criterion == "det" else criterion, "covariance": covariance or None,
-            **changes._replace(link=None)._asdict(),
+            "output": to.output, "criterion": None if criterion == "det" else criterion, "covariance": to.covariance,
+            **vars(replace(changes, link=None)),
         }  # fmt: skip
         check_robots(robots, others, metric)
-        check_files(None, plot)
-        show_robots(robots, changes.link, names, seed, Written(format, None, plot, digits))
+        to.check()
+        show_robots(robots, changes.link, names, seed, to)
         return
     if robots != RobotOptions():
         raise UsageError(f"--data, --landmarks, --until, --runs, --white: expected with {ROBOTS} alone, got {scenario}")
@@ -163,38 +169,33 @@ def run(
     files = [file for file in (measurements, arrivals, truth, initial) if file is not None]
     if [*files, scenario].count("-") > 1:
         raise UsageError("expected at most one file on standard input, got - for several")
-    check_estimates(output)
-    check_files(output, plot, scenario, *files)
-    page.check(output, plot, scenario, *files)
+    to.check(scenario, *files)
     given, links = changes.of(scenario)
     first = initial or beside(measurements)
-    records = read_records(given, measurements, arrivals, truth, first, pairs("--columns", columns))
+    records = read_records(given, measurements, arrivals, truth, first, renamed(columns, "OURS=THEIRS"))
     chosen = metric_of(metric or given.metric or "trace", given.model)
     way = Way(names or (given.estimator or LFG,), one_link(links, case), seed, criterion)
     writing: Any = nullcontext()
-    if output is not None:
-        writing = EstimatesFile(output, records.scenario, truth=truth is not None, covariance=covariance)
-    elif covariance:
+    if to.output is not None:
+        writing = EstimatesFile(to.output, records.scenario, truth=truth is not None, covariance=to.covariance)
+    elif to.covariance:
         raise UsageError("--covariance: expected --output FILE to write them to")
     with writing as file:
         found = run_records(records, chosen, way, None if file is None else file.write)
-    show(found, format, plot, digits, page)
+    show(found, to)
 
 
 def check_robots(robots: RobotOptions, others: Mapping[str, object], metric: str | None) -> None:
     """Raise UsageError if an option does not go with a record of robots, or its folder is not given."""
     if robots.data is None:
         raise UsageError(f"--data: expected a folder with a record of robots, as {ROBOTS} needs one, got none")
-    given = [name for name, value in others.items() if value is not None]
-    if given:
-        raise UsageError(f"--{given[0]}: expected a scenario, got {ROBOTS}, whose record is all in --data")
+    flags = {f"--{name}": value for name, value in others.items()}
+    refuse(flags, f"a scenario, got {ROBOTS}, whose record is all in --data")
     if metric not in (None, "rms:x,y"):
         raise UsageError(f"--metric: expected rms:x,y with {ROBOTS}, got {metric}")
 
 
-def show_robots(
-    robots: RobotOptions, link: str | None, names: tuple[str, ...] | None, seed: int, written: Written
-) -> None:
+def show_robots(robots: RobotOptions, link: str | None, names: tuple[str, ...] | None, seed: int, to: Beside) -> None:
     """Run estimators on a record of robots, and write the report."""
     from stochfuse.data.robot_filters import ESTIMATORS as TAKEN
     from stochfuse.data.robot_run import run_robots
@@ -205,20 +206,19 @@ def show_robots(
         str(robots.data), links, names or TAKEN, runs=robots.runs, seed=seed, landmarks=robots.landmarks,
         until=robots.until, noises="white" if robots.white else "identified",
     )  # fmt: skip
-    written.write(robot_report(found, min(written.digits, 3)))
+    report = robot_report(found, min(to.digits, 3))
+    to.write(report)
+    to.send(report, {})
 
 
-def show(found: RunResult, format: str | None, plot: Path | None, digits: int, page: Reported = Reported()) -> None:
+def show(found: RunResult, to: Beside) -> None:
     """Write a run's notes, report and figure."""
-    from stochfuse.report.plot import save
     from stochfuse.report.runs import run_report
 
-    report = run_report(found, digits)
+    report = run_report(found, to.digits)
     said = tell(f"note: {note}" for note in (*found.notes, *(suspicion.text for suspicion in found.suspicions)))
-    if plot is not None and report.draw is not None:
-        save(report.draw, plot)
-    write_report(report, chosen_format(format, None), None)
-    page.write(report, found.scenario.to_mapping(), said)
+    to.write(report)
+    to.send(report, found.scenario.to_mapping(), said)
 
 
 def one_link(links: list[float] | None, case: str | None = None) -> float | str | None:
@@ -230,13 +230,6 @@ def one_link(links: list[float] | None, case: str | None = None) -> float | str 
     if links is not None and len(links) > 1:
         raise UsageError(f"--link: expected one link probability, got {len(links)}")
     return None if links is None else links[0]
-
-
-def check_estimates(output: Path | None) -> None:
-    """Raise UsageError early if estimates can never be written to a file."""
-    from stochfuse.report.table import check_writable
-
-    check_writable(output, (".csv", ".parquet"))
 
 
 def beside(measurements: str) -> str | None:

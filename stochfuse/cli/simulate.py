@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
-
-import typer
 
 from stochfuse.cli.options import (
     OUTPUT,
     RARE,
     WORK,
+    Beside,
     Changes,
-    DigitsOption,
-    FormatOption,
     MetricOption,
-    PlotOption,
     ScenarioArgument,
     check_files,
     named,
     option,
+    tell,
 )
 from stochfuse.cli.run import CaseOption, CriterionOption, EstimatorsOption, one_link, show
 from stochfuse.errors import UsageError
@@ -31,6 +29,26 @@ EXAMPLES = (
 )
 
 
+@dataclass(frozen=True)
+class Files(Beside):
+    """A report on standard output, and what was drawn in a folder."""
+
+    output: Annotated[
+        Path | None,
+        option(
+            "Folder for measurements.csv, arrivals.csv, truth.csv, initial.csv and estimates.csv.",
+            OUTPUT, "--output", "-o", metavar="FOLDER",
+        ),
+    ] = None  # fmt: skip
+    force: Annotated[bool, option("Replace such files in the folder.", OUTPUT + RARE, "--force")] = False
+
+    def check(self, *inputs: str | None) -> None:
+        """See `Listed.check`."""
+        if self.output is not None and self.output.exists() and not self.output.is_dir():
+            raise UsageError(f"--output: expected a folder, got the file {self.output}")
+        check_files(inputs, None, self.plot, self.report)
+
+
 def simulate(
     scenario: ScenarioArgument = "thesis-transient",
     changes: Changes = Changes(),
@@ -40,18 +58,8 @@ def simulate(
     estimator: EstimatorsOption = None,
     criterion: CriterionOption = "det",
     metric: MetricOption = None,
-    format: FormatOption = None,
-    output: Annotated[
-        Path | None,
-        option(
-            "Folder for measurements.csv, arrivals.csv, truth.csv, initial.csv and estimates.csv.",
-            OUTPUT, "--output", "-o", metavar="FOLDER",
-        ),
-    ] = None,
-    force: Annotated[bool, option("Replace such files in the folder.", OUTPUT + RARE, "--force")] = False,
-    plot: PlotOption = None,
-    digits: DigitsOption = 5,
-) -> None:  # fmt: skip
+    to: Files = Files(),
+) -> None:
     """Draw truth, measurements and arrivals, run estimators on them, and lay their errors beside the prediction.
 
     Sensors by name measure by their true functions, and the filters are extended ones: the realised error says how
@@ -60,9 +68,7 @@ def simulate(
     from stochfuse.data.simulate import simulate as simulated
 
     names = None if estimator is None else named(estimator)
-    if output is not None and output.exists() and not output.is_dir():
-        raise UsageError(f"--output: expected a folder, got the file {output}")
-    check_files(None, plot, scenario)
+    to.check(scenario)
     given, links = changes.of(scenario)
     way = {
         "estimator": names or (given.estimator or LFG,),
@@ -70,8 +76,8 @@ def simulate(
         "seed": seed,
         "criterion": criterion,
     }
-    found = simulated(given, runs, metric=metric, folder=output, force=force, **way)
-    show(found, format, plot, digits)
-    if output is not None:
-        files = " ".join(f"--{name} {output / f'{name}.csv'}" for name in ("measurements", "arrivals", "truth"))
-        typer.echo(f"note: written to {output}: run the same with {files}", err=True)
+    found = simulated(given, runs, metric=metric, folder=to.output, force=to.force, **way)
+    show(found, to)
+    if to.output is not None:
+        files = " ".join(f"--{name} {to.output / f'{name}.csv'}" for name in ("measurements", "arrivals", "truth"))
+        tell([f"note: written to {to.output}: run the same with {files}"])

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
-
-import typer
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
 
 from stochfuse.cli.options import (
     RARE,
@@ -22,6 +21,7 @@ from stochfuse.cli.options import (
     option,
     over_ends,
     settings_for,
+    tell,
     whose,
 )
 from stochfuse.errors import UsageError
@@ -42,7 +42,8 @@ NOT_CRITICAL = ("target", "agents-needed", "sensitivity", "gain", "steady", "ove
 """Questions about a number, which has a step and a metric; whether it is bounded is the same in all of them."""
 
 
-class SolveRequest(NamedTuple):
+@dataclass(frozen=True)
+class SolveRequest:
     """Which question."""
 
     target: Annotated[
@@ -253,7 +254,5 @@ def _single(links: list[float] | None, kind: str) -> float:
 
 
 def _note(sheet: SolutionSheet) -> None:
-    for note in sheet.prediction.notes:
-        typer.echo(f"note: {note}", err=True)
-    if sheet.question.metric.mixed:
-        typer.echo(f"note: {sheet.question.metric.name} adds up different units; see --metric", err=True)
+    mixed = [f"{sheet.question.metric.name} adds up different units; see --metric"] * sheet.question.metric.mixed
+    tell(f"note: {note}" for note in (*sheet.prediction.notes, *mixed))

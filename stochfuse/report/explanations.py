@@ -6,7 +6,7 @@ from textwrap import fill
 from typing import NamedTuple
 
 from stochfuse.errors import UsageError, nearest
-from stochfuse.report.table import Report, Table, to_csv
+from stochfuse.report.table import Report
 from stochfuse.scenario import capabilities, registry
 
 SCHEMA = "stochfuse.explanation/1"
@@ -157,13 +157,8 @@ def explained(word: str | None, width: int) -> tuple[str, Report]:
     text = (
         "\n".join(fill(f"{one.word} ({one.kind}): {one.text}", width, subsequent_indent="  ") for one in chosen) + "\n"
     )
-    keys = Entry._fields
-    report = Report(
-        lambda: Table(("What the words mean",), keys, (), tuple(tuple(one) for one in chosen)),
-        lambda: to_csv(keys, chosen),
-        lambda: {"schema": SCHEMA, "explanations": [one._asdict() for one in chosen]},
-    )
-    return text, report
+    facts = {"schema": SCHEMA, "explanations": [one._asdict() for one in chosen]}
+    return text, Report.of_rows(("What the words mean",), Entry._fields, chosen, facts)
 
 
 def _sentences(*texts: str) -> str:
