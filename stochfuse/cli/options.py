@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
@@ -125,10 +126,20 @@ def named(text: str) -> tuple[str, ...]:
     UsageError
         If one is unknown or named twice.
     """
-    try:
+    with options_for("estimator"):
         return estimators_named([name.strip() for name in text.split(",")], here=True)
+
+
+@contextmanager
+def options_for(*names: str) -> Iterator[None]:
+    """Let errors about parameters of those names speak of options: `initial_error:` becomes `--initial-error:`."""
+    try:
+        yield
     except UsageError as error:
-        raise UsageError(f"--{error}") from None
+        name, colon, rest = str(error).partition(":")
+        if name.partition(" ")[0] not in names:
+            raise
+        raise UsageError(f"--{name.replace('_', '-')}{colon}{rest}") from None
 
 
 def _one_named(text: str | None) -> str | None:
@@ -381,6 +392,10 @@ class Reported(Written):
 @dataclass(frozen=True)
 class Beside(Reported):
     """The same where --output is for something else than the answer, which goes to standard output."""
+
+    format: Annotated[
+        str | None, choice(FORMATS, f"{', '.join(FORMATS)}; default: table.", OUTPUT, "--format", "-f")
+    ] = None
 
     @property
     def target(self) -> None:

@@ -18,12 +18,8 @@ from stochfuse.prediction.compare import Comparison, EstimatorComparison
 from stochfuse.prediction.expected_states import ExpectedStates
 from stochfuse.prediction.result import Prediction
 from stochfuse.prediction.swept import Swept
-from stochfuse.questions.agents_needed import AgentsNeeded
 from stochfuse.questions.critical import Critical
-from stochfuse.questions.least_link import LeastLink
-from stochfuse.questions.least_value import LeastValue
 from stochfuse.questions.messages import MessageLoad, SweptLoad
-from stochfuse.questions.sensitivity import Sensitivity, ShareOfGain
 from stochfuse.report import (
     comparisons,
     crosschecks,
@@ -46,14 +42,6 @@ from stochfuse.scenario.links import Links
 from stochfuse.scenario.over import Over
 from stochfuse.studies.files import Results
 
-SHEETS = {
-    AgentsNeeded: solutions.agents_sheet,
-    LeastLink: solutions.least_link_sheet,
-    LeastValue: solutions.value_sheet,
-    Sensitivity: solutions.sensitivity_sheet,
-    ShareOfGain: solutions.gain_sheet,
-}
-
 
 def report_of(result: Any, of: str | None = None, agent: int | str = "mean") -> Report:
     """Return a result in every form.
@@ -63,9 +51,8 @@ def report_of(result: Any, of: str | None = None, agent: int | str = "mean") -> 
     of : metric of the covariance; default: the scenario's, else trace.
     agent : "mean", "worst", "best" or a number from 1.
     """
-    sheet = SHEETS.get(type(result))
-    if sheet is not None:
-        return solutions.solution_report(sheet(result), result)
+    if type(result) in solutions.SHEETS:
+        return solutions.solution_report(solutions.sheet_of(result), result)
     if isinstance(result, Critical):
         return critical_report(result)
     if isinstance(result, ProtocolLoad):

@@ -365,6 +365,20 @@ def steady_sheet(asked: Question, prediction: Prediction, digits: int = 5) -> So
     return SolutionSheet("steady", asked, p, answer, *table, headings, tuple(records), facts)
 
 
+SHEETS: dict[type, Callable[..., SolutionSheet]] = {
+    LeastLink: least_link_sheet,
+    LeastValue: value_sheet,
+    AgentsNeeded: agents_sheet,
+    Sensitivity: sensitivity_sheet,
+    ShareOfGain: gain_sheet,
+}
+
+
+def sheet_of(found: Any, digits: int = 5) -> SolutionSheet:
+    """Return the sheet of an answer; a steady state has `steady_sheet`."""
+    return SHEETS[type(found)](found, digits)
+
+
 def _bounded(bound: float) -> str:
     if not bound:
         return ""
