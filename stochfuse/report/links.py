@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse.report.network_figure import draw_network
+from stochfuse.report.network_figure import draw_circle, draw_network
 from stochfuse.report.plot import canvas, titled
 from stochfuse.report.table import Report, Table, listed, stamped, to_csv
 from stochfuse.scenario.links import MEMORY, Links
@@ -245,29 +245,9 @@ def draw(found: Links) -> Any:
             µ = found.link[i, j]
             left.text(j, i, f"{µ:.2f}", ha="center", va="center", fontsize="x-small", color="w" if µ < 0.6 else "k")
     figure.colorbar(image, ax=left, label="link probability µ (grey: unknown)", shrink=0.8)
-    angle = 2 * np.pi * np.arange(n) / n
-    x, y = np.sin(angle), np.cos(angle)
-    for i, j in zip(*np.nonzero(np.nan_to_num(found.link) > 0), strict=True):
-        right.annotate(
-            "",
-            (x[i] * 0.93, y[i] * 0.93),
-            (x[j] * 0.93, y[j] * 0.93),
-            arrowprops={
-                "arrowstyle": "-|>",
-                "linewidth": 0.3 + 2.0 * found.link[i, j],
-                "color": str(round(0.85 - 0.85 * float(found.link[i, j]), 3)),
-                "connectionstyle": "arc3,rad=0.08",
-                "shrinkA": 0,
-                "shrinkB": 0,
-            },
-        )
-    for node, a, b in zip(found.nodes, x, y, strict=True):
-        right.text(1.12 * a, 1.12 * b, node, ha="center", va="center", fontsize="small")
-    right.set_xlim(-1.35, 1.35)
-    right.set_ylim(-1.35, 1.35)
-    right.set_aspect("equal")
-    right.set_axis_off()
-    titled(
-        figure, f"Link probabilities of {found.source} ({found.kind})", "right: the darker and thicker, the likelier"
-    )
+    name = draw_circle(right, found)
+    about = "right: the darker and thicker, the likelier"
+    titled(figure, f"Link probabilities of {found.source} ({found.kind})", about)
+    figure.draw_without_rendering()
+    name()
     return figure

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,19 @@ from stochfuse.scenario.links import Links
 from stochfuse.scenario.over import Over
 from stochfuse.studies.files import Results
 
+REPORTS: dict[Any, Callable[[Any], Report]] = {
+    Critical: critical_report,
+    ProtocolLoad: lambda found: protocols.protocol_report(protocols.ProtocolView(found)),
+    MessageLoad: lambda found: messages.load_report(messages.LoadView((found,), found)),
+    SweptLoad: lambda found: messages.load_report(messages.LoadView((found,), found)),
+    Results: lambda found: study_figures.summary_report(found, 5),
+    Links: links.links_report,
+    RunResult: run_report,
+    RobotRun: robot_report,
+    Verdict: lambda found: crosschecks.crosscheck_report(crosschecks.CrosscheckView(found)),
+}
+"""What shows a result that is shown in one way only."""
+
 
 def report_of(result: Any, of: str | None = None, agent: int | str = "mean") -> Report:
     """Return a result in every form.
@@ -53,24 +67,11 @@ def report_of(result: Any, of: str | None = None, agent: int | str = "mean") -> 
     """
     if type(result) in solutions.SHEETS:
         return solutions.solution_report(solutions.sheet_of(result), result)
-    if isinstance(result, Critical):
-        return critical_report(result)
-    if isinstance(result, ProtocolLoad):
-        return protocols.protocol_report(protocols.ProtocolView(result))
-    if isinstance(result, MessageLoad | SweptLoad):
-        return messages.load_report(messages.LoadView((result,), result))
-    if isinstance(result, Results):
-        return study_figures.summary_report(result, 5)
-    if isinstance(result, Links):
-        return links.links_report(result)
-    if isinstance(result, RunResult):
-        return run_report(result)
-    if isinstance(result, RobotRun):
-        return robot_report(result)
+    for kind, report in REPORTS.items():
+        if isinstance(result, kind):
+            return report(result)
     if isinstance(result, ExpectedStates):
         return states_report(StatesView(result, agent))
-    if isinstance(result, Verdict):
-        return crosschecks.crosscheck_report(crosschecks.CrosscheckView(result))
     scenario = (result if isinstance(result, Prediction | Swept) else result.predictions[0]).scenario
     chosen = metric(of or scenario.metric or "trace", scenario.model)
     if isinstance(result, EstimatorComparison):
