@@ -34,7 +34,7 @@ class ProgressThread(Progress):
 
     def expect(self, outcomes: int, graphs: int) -> None:
         """Say how much work there is."""
-        from stochfuse.report.predictions import counted
+        from stochfuse.report.table import counted
 
         work = f"{counted(outcomes, 'outcome')}; about {counted(graphs, 'different graph')} to carry"
         typer.echo(f"note: {work}", err=True)

@@ -16,8 +16,8 @@ from stochfuse.data.causes import summary
 from stochfuse.data.crosscheck import Cell, Verdict
 from stochfuse.kalman.metrics import metric
 from stochfuse.report.plot import DASHES, MARKERS, below, canvas, entry, labelled, shades, spread, titled
-from stochfuse.report.predictions import PredictionView, counted
-from stochfuse.report.table import Report, Table, listed, number, records_csv, stamped
+from stochfuse.report.predictions import PredictionView
+from stochfuse.report.table import Report, Table, counted, listed, number, records_csv, stamped
 from stochfuse.scenario.registry import OPTIMAL
 
 SCHEMA = "stochfuse.crosscheck/1"

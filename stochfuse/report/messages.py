@@ -81,15 +81,12 @@ class LoadView:
     @property
     def whom(self) -> str:
         """One line: the scenario, whose load and which steps."""
-        scenario, one = self.loads[0].scenario, self.loads[0].alike
-        numbers = [s.network.agents for s in (self.rows.over.scenarios if self.rows.over else (scenario,))]
-        n = max(numbers)
         whose = "an agent picked at random" if self.agent == "mean" else f"agent {self.agent}"
-        if n == 1 or one:
-            whose = "alone" if n == 1 else "every agent alike"
-        span = f"{min(numbers)} to " * (len(set(numbers)) > 1) + str(n)
-        agents = f"{span} agent{'s' * (n > 1)}, {scenario.network.architecture}"
-        return f"{scenario.name}: {agents}; {whose}; {self.window}{self.rows.common}"
+        if self.rows.sizes == [1]:
+            whose = "alone"
+        elif self.loads[0].alike:
+            whose = "every agent alike"
+        return f"{self.rows.agents}; {whose}; {self.window}{self.rows.common}"
 
     @property
     def what(self) -> str:

@@ -104,8 +104,20 @@ def _places(found: Links, step: int) -> np.ndarray:
     """Where the agents are at a step, (n, 2)."""
     if found.places:
         return np.array([place[step - 1, :2] if place.ndim == 2 else place[:2] for place in found.places])
-    angle = 2 * np.pi * np.arange(len(found.nodes)) / len(found.nodes)
+    return circle(len(found.nodes))
+
+
+def circle(n: int) -> np.ndarray:
+    """Return n places on a circle, (n, 2), from the top clockwise."""
+    angle = 2 * np.pi * np.arange(n) / n
     return np.stack([np.sin(angle), np.cos(angle)], axis=1)
+
+
+def arc(start: np.ndarray, end: np.ndarray, points: int = POINTS) -> np.ndarray:
+    """Return points of the arc from a place to another, (points, 2)."""
+    t = np.linspace(0.0, 1.0, points)[:, None]
+    middle = (start + end) / 2 + 2 * BEND * np.array([end[1] - start[1], start[0] - end[0]])
+    return (1 - t) ** 2 * start + 2 * t * (1 - t) * middle + t**2 * end
 
 
 def _limits(found: Links) -> tuple[np.ndarray, np.ndarray]:
@@ -172,16 +184,8 @@ def _draw_panel(axes: Any, panel: _NetworkPanel, found: Links) -> Callable[[], N
 
 def _arcs(panel: _NetworkPanel) -> list[_Arc]:
     """Links as arcs from sender to receiver; one for both ways where all are alike."""
-    arcs, t = [], np.linspace(0.0, 1.0, POINTS)[:, None]
-    for i, j in np.argwhere(panel.link >= LEAST):
-        if panel.alike and i < j:
-            continue
-        start, end = panel.places[j], panel.places[i]
-        across = np.array([end[1] - start[1], start[0] - end[0]])
-        middle = (start + end) / 2 + 2 * BEND * across
-        line = (1 - t) ** 2 * start + 2 * t * (1 - t) * middle + t**2 * end
-        arcs.append(_Arc(line, float(panel.link[i, j])))
-    return arcs
+    drawn = [(i, j) for i, j in np.argwhere(panel.link >= LEAST) if i >= j or not panel.alike]
+    return [_Arc(arc(panel.places[j], panel.places[i]), float(panel.link[i, j])) for i, j in drawn]
 
 
 def _labels(found: Links, panel: _NetworkPanel) -> list[str]:

@@ -33,8 +33,8 @@ from stochfuse.report.plot import (
     labelled,
     titled,
 )
-from stochfuse.report.rows import ResultRows, ShownCurve
-from stochfuse.report.table import Report, Table, listed, number, stamped, to_csv
+from stochfuse.report.rows import ResultRows, ShownCurve, whose
+from stochfuse.report.table import Report, Table, counted, listed, number, stamped, to_csv
 from stochfuse.scenario.registry import OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.registry import title as method_title
 
@@ -244,11 +244,7 @@ class PredictionView:
     @property
     def whom(self) -> str:
         """One line: the scenario and whose covariance."""
-        scenario = self.prediction.scenario
-        numbers = [part.scenario.network.agents for part in self.parts]
-        n = f"{min(numbers)} to " * (len(set(numbers)) > 1) + str(max(numbers))
-        agents = f"{n} agent{'s' * (max(numbers) > 1)}, {scenario.network.architecture}{self._links}"
-        return f"{scenario.name}: {agents}; {self._of}{self.rows.common}"
+        return f"{self.rows.agents}{self._links}; {self._of}{self.rows.common}"
 
     @property
     def _links(self) -> str:
@@ -261,13 +257,8 @@ class PredictionView:
     def _of(self) -> str:
         if self.prediction.alike:
             return "every agent alike" if any(len(part.group_of) > 1 for part in self.parts) else "alone"
-        random = self.statistic not in ("mean", "derivative")
-        texts = {
-            "mean": "of an agent picked at random" if random else "covariance averaged over the agents",
-            "worst": "the agent with the largest value",
-            "best": "the agent with the smallest value",
-        }
-        return texts.get(str(self.agent), f"agent {self.agent}")
+        random = self.statistic not in ("mean", "derivative") and self.agent == "mean"
+        return "of an agent picked at random" if random else whose(self.agent)
 
     @property
     def how(self) -> str:
@@ -301,12 +292,6 @@ class PredictionView:
         if p.nature == "exact" or "left_out" not in p.meta:
             return f"{p.nature}{everything}"
         return f"approximate{everything} less those of probability up to {np.max(p.meta['left_out']):.2g}"
-
-
-def counted(number: int, what: str) -> str:
-    """Return a number with its noun."""
-    shown = f"{number:,}" if number < 10**15 else f"{number:.3g}"
-    return f"{shown} {what}{'s' * (number != 1)}"
 
 
 def _finite(values: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from stochfuse.data.consistency import Average
 from stochfuse.data.run import Row, RunResult, Trace
 from stochfuse.report.plot import band, below, canvas, labelled, look, titled
-from stochfuse.report.table import Report, Table, number, records_csv, stamped
+from stochfuse.report.table import Report, Table, counted, number, records_csv, stamped
 
 SCHEMA = "stochfuse.run/1"
 MOST_AGENTS = 6
@@ -26,7 +26,7 @@ def _titles(found: RunResult) -> tuple[str, ...]:
     network, metric = found.scenario.network, found.metric
     unit = f" [{metric.unit}]" if metric.unit else ""
     arrivals = "arrivals drawn from the links" if found.drawn else "arrivals as recorded"
-    runs = f"{found.runs:,} run{'s' * (found.runs != 1)} of {network.steps:,} steps"
+    runs = f"{counted(found.runs, 'run')} of {network.steps:,} steps"
     truth = any(row.realised is not None for row in found.rows)
     return (
         f"Estimators on data of {found.scenario.name}: {metric.label}{unit}; posterior, mean over steps",

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.report.predictions import counted
-from stochfuse.report.table import Table, listed, number, records_csv, stamped
+from stochfuse.report.rows import whose
+from stochfuse.report.table import Table, counted, listed, number, records_csv, stamped
 from stochfuse.scenario.registry import OPTIMAL
 from stochfuse.studies.pareto import ParetoFront
 from stochfuse.studies.plan import ERROR, NODES, Plan
@@ -38,16 +38,6 @@ def design(plan: Plan) -> str:
     kinds = {"grid": "grid", "list": "list", "latin-hypercube": "Latin hypercube"}
     several = [f"{axis.name} ({'range' if axis.values is None else len(axis.values)})" for axis in plan.axes]
     return f"{kinds[plan.kind]} of {counted(plan.size, 'point')} over {', '.join(several)}"
-
-
-def whose(plan: Plan) -> str:
-    """Whose covariance it is, in words."""
-    texts = {
-        "mean": "covariance averaged over the agents",
-        "worst": "the agent with the largest value",
-        "best": "the agent with the smallest value",
-    }
-    return texts.get(str(plan.agent), f"agent {plan.agent}")
 
 
 def spoken(plan: Plan, column: str) -> str:
@@ -202,7 +192,7 @@ def titles(results: Results, summary: Summary) -> tuple[str, ...]:
     more = results.failed - len(results.first_errors)
     return (
         f"Study {plan.name}: {design(plan)}",
-        f"Scenario {plan.scenario_name}; {whose(plan)}",
+        f"Scenario {plan.scenario_name}; {whose(plan.agent)}",
         f"{results.path.name}: {counted(results.rows, 'row')}, {failures(results.failed)}",
         *(f"failed: {points}: {reason}" for points, reason in _together(results.first_errors)),
         *([f"failed: {counted(more, 'point')} more"] if more else []),
@@ -282,7 +272,7 @@ def pareto_titles(found: ParetoFront, results: Results) -> tuple[str, ...]:
     fixed = "".join(f", {name} = {shortened(value)}" for name, value in _fixed(found, plan).items())
     return (
         f"Study {plan.name}: accuracy against message load; no point does better in both than {these}",
-        f"Scenario {plan.scenario_name}; {whose(plan)}; {counted(found.compared, 'point')} compared{fixed}, "
+        f"Scenario {plan.scenario_name}; {whose(plan.agent)}; {counted(found.compared, 'point')} compared{fixed}, "
         f"{failures(results.failed)}",
         f"load: {load_label(plan)}",
         f"accuracy: {spoken(plan, found.column)}, after {when}; {natures}"

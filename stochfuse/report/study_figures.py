@@ -17,8 +17,8 @@ import numpy as np
 from stochfuse.errors import UsageError
 from stochfuse.report import studies
 from stochfuse.report.plot import COLORS, DASHES, MARKERS, canvas, labelled, spread
-from stochfuse.report.predictions import counted
-from stochfuse.report.studies import LONGEST, load_label, shortened, spoken, whose, words_of
+from stochfuse.report.rows import whose
+from stochfuse.report.studies import LONGEST, load_label, shortened, spoken, words_of
 from stochfuse.report.study_slices import (
     MARKED,
     MOST_DRAWN,
@@ -31,7 +31,7 @@ from stochfuse.report.study_slices import (
     sliced,
     thinned,
 )
-from stochfuse.report.table import Report, number
+from stochfuse.report.table import Report, counted, number
 from stochfuse.studies.pareto import ParetoFront
 from stochfuse.studies.plan import NODES, Axis, Plan
 
@@ -225,7 +225,7 @@ def _not_drawn(failed: int) -> str:
 def _entitle(axes: Any, title: str, plan: Plan, lines: Sequence[str]) -> None:
     """Write the title, and under it which study it is and the lines that are not empty."""
     axes.figure.suptitle(wrapped(title[0].upper() + title[1:], 80), fontsize="medium")
-    whole = [f"Study {plan.name}, scenario {plan.scenario_name}; {whose(plan)}", *filter(None, lines)]
+    whole = [f"Study {plan.name}, scenario {plan.scenario_name}; {whose(plan.agent)}", *filter(None, lines)]
     axes.set_title("\n".join(wrapped(line, 95) for line in whole), fontsize=SMALL)
 
 

@@ -90,6 +90,12 @@ def number(value: float, digits: int = 5) -> str:
     return text[:-1] if text.endswith(".") else text
 
 
+def counted(number: int, what: str) -> str:
+    """Return a number with its noun: "1 point", "1,100 points"."""
+    shown = f"{number:,}" if number < 10**15 else f"{number:.3g}"
+    return f"{shown} {what}{'s' * (number != 1)}"
+
+
 MOST_ROWS = 400
 """Rows that a table for a terminal shows; beyond that the middle is left out."""
 
