@@ -43,8 +43,7 @@ def crosscheck(
     scenario: ScenarioArgument = "thesis-transient",
     changes: Changes = Changes(),
     columns: Annotated[
-        str | None,
-        option("FILE's own names: covariance=P_trace,link=mu.", SHOWN, metavar="OURS=THEIRS"),
+        str | None, option("FILE's own names: covariance=P_trace,link=mu.", SHOWN, metavar="OURS=THEIRS")
     ] = None,
     method: Annotated[
         str | None,
@@ -58,8 +57,7 @@ def crosscheck(
     estimator: EstimatorOption = None,
     metric: MetricOption = None,
     alpha: Annotated[
-        float,
-        option("Probability to call a right simulator wrong; default: 0.001.", SHOWN, metavar="P"),
+        float, option("Probability to call a right simulator wrong; default: 0.001.", SHOWN, metavar="P")
     ] = 0.001,
     averaging: Averaging = Averaging(),
     to: Reported = Reported(),

@@ -59,12 +59,7 @@ class LoadOptions:
         option("Bytes of every message beside its nodes; sets --bytes.", SHOWN + RARE, min=0, metavar="BYTES"),
     ] = None
     protocol: Annotated[
-        str | None,
-        option(
-            "Live agents instead: acknowledged, full, own, window:W, or several.",
-            SHOWN,
-            metavar="NAME",
-        ),
+        str | None, option("Live agents instead: acknowledged, full, own, window:W, or several.", SHOWN, metavar="NAME")
     ] = None
     missing: Annotated[
         str | None,
@@ -92,8 +87,7 @@ def messages(
     ] = "mean",
     shown: LoadOptions = LoadOptions(),
     method: Annotated[
-        str,
-        choice((EXACT, MONTE_CARLO), "exact; or monte-carlo, for networks too large for it; default: exact.", WORK),
+        str, choice((EXACT, MONTE_CARLO), "exact; or monte-carlo, for networks too large for it; default: exact.", WORK)
     ] = EXACT,
     outcomes: Outcomes = Outcomes(),
     to: Written = Written(),

@@ -51,8 +51,7 @@ EstimatorsOption = Annotated[
     ),
 ]
 CaseOption = Annotated[
-    str | None,
-    option("Arrivals are drawn from the links of this case.", NETWORK + RARE, metavar="NAME"),
+    str | None, option("Arrivals are drawn from the links of this case.", NETWORK + RARE, metavar="NAME")
 ]
 CriterionOption = Annotated[
     str,

@@ -207,12 +207,7 @@ def _one_of_models(text: str) -> str:
 
 
 def _written(
-    model: str = "random-walk",
-    axes: int = 1,
-    noise: float = 1.0,
-    sigma: float = 10.0,
-    unit: str = "m",
-    **network: Any,
+    model: str = "random-walk", axes: int = 1, noise: float = 1.0, sigma: float = 10.0, unit: str = "m", **network: Any
 ) -> str:
     """Return a commented scenario file."""
     if not 1 <= axes <= 3:

@@ -63,12 +63,10 @@ class SolveRequest:
         False
     )
     steady: Annotated[
-        bool,
-        option("Ask about the steady state; alone: tabulate it over --link.", QUESTION, "--steady"),
+        bool, option("Ask about the steady state; alone: tabulate it over --link.", QUESTION, "--steady")
     ] = False
     critical: Annotated[
-        bool,
-        option("The µ above which the average stays bounded, proved.", QUESTION, "--critical"),
+        bool, option("The µ above which the average stays bounded, proved.", QUESTION, "--critical")
     ] = False
 
     @property

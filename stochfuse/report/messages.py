@@ -14,7 +14,7 @@ from stochfuse.questions.messages import IDENTITY_BYTES, NUMBER_BYTES, Accuracy,
 from stochfuse.report.plot import COLORS, MARKERS, MOST_MARKED, band, below, canvas, labelled, shades, spread, titled
 from stochfuse.report.predictions import WIDTH_95, PredictionView
 from stochfuse.report.rows import ResultRows
-from stochfuse.report.table import Report, Table, number, stamped, to_csv
+from stochfuse.report.table import Report, Table, number, records_csv, stamped
 from stochfuse.scenario.registry import LFG, NAIVE
 
 SCHEMA = "stochfuse.messages/1"
@@ -25,17 +25,6 @@ RULE_TITLES = {
 }
 KINDS = ("moments", "distribution", "cdf", "accuracy")
 RULE_DASHES = ("-", "--")
-_SIZES = ("nodes", "probability", "cumulative")
-HEADINGS = {
-    "moments": ("mean", "std", "max", "standard_error", "mean_bytes", "max_bytes"),
-    "distribution": _SIZES,
-    "cdf": _SIZES,
-    "accuracy": (
-        "mean", "mean_bytes", "metric", "unit", "quantity", "method", "accuracy_nature", "accuracy",
-        "accuracy_standard_error_at_most",
-    ),
-}  # fmt: skip
-"""What CSV has beside the columns that every kind has."""
 
 
 @dataclass(frozen=True)
@@ -188,49 +177,50 @@ def _distribution_table(view: LoadView) -> Table:
 
 def load_csv(view: LoadView) -> str:
     """One line per rule and link probability, for distributions per size too."""
-    headings = ["rule", "nature", "agent", *view.rows.headings, "from_step", "to_step"]
-    headings += HEADINGS[view.kind]
-    rows: list[tuple[Any, ...]] = []
+    records = []
     for r, load in enumerate(view.loads):
         first, last = map(int, load.steps[[0, -1]])
         for i in range(len(load.link)):
-            start = (load.rule, load.nature, view.agent, *view.rows.record(i), first, last)
+            names = dict(zip(view.rows.headings, view.rows.record(i), strict=True))
+            start = {"rule": load.rule, "nature": load.nature, "agent": view.agent, **names}
+            start |= {"from_step": first, "to_step": last}
             if view.kind == "moments":
-                rows.append((*start, *_moments_cells(view, load, i)))
+                records.append(start | _moments(view, load, i))
             elif view.kind == "accuracy":
-                rows.append((*start, *_accuracy_cells(view, view.accuracies[r], i)))
+                records.append(start | _accuracy(view, view.accuracies[r], i))
             else:
                 both = zip(load.distribution(view.agent)[i].tolist(), load.cdf(view.agent)[i].tolist(), strict=True)
-                rows += [(*start, size, *each) for size, each in enumerate(both)]
-    return to_csv(headings, rows)
+                records += [
+                    start | {"nodes": size, "probability": p, "cumulative": q} for size, (p, q) in enumerate(both)
+                ]
+    return records_csv(tuple(records[0]), records)
 
 
-def _moments_cells(view: LoadView, load: Load, row: int) -> tuple[Any, ...]:
+def _moments(view: LoadView, load: Load, row: int) -> dict[str, Any]:
     error, size = load.standard_error(view.agent), view.bytes_of(load)
-    return (
-        float(load.mean(view.agent)[row]),
-        float(load.std(view.agent)[row]),
-        int(load.maximum(view.agent)[row]),
-        None if error is None else float(error[row]),
-        float(size.mean[row]),
-        int(size.maximum[row]),
-    )
+    return {
+        "mean": float(load.mean(view.agent)[row]),
+        "std": float(load.std(view.agent)[row]),
+        "max": int(load.maximum(view.agent)[row]),
+        "standard_error": None if error is None else float(error[row]),
+        "mean_bytes": float(size.mean[row]),
+        "max_bytes": int(size.maximum[row]),
+    }
 
 
-def _accuracy_cells(view: LoadView, accuracy: Accuracy, row: int) -> tuple[Any, ...]:
-    shown = view.accuracy_view(accuracy)
-    load, p = accuracy.load, accuracy.prediction
-    return (
-        float(load.mean(view.agent)[row]),
-        float(view.bytes_of(load).mean[row]),
-        shown.metric.name,
-        shown.unit,
-        p.quantity,
-        p.method,
-        p.nature,
-        float(accuracy.values[row]),
-        None if accuracy.error is None else float(accuracy.error[row]),
-    )
+def _accuracy(view: LoadView, accuracy: Accuracy, row: int) -> dict[str, Any]:
+    shown, load, p = view.accuracy_view(accuracy), accuracy.load, accuracy.prediction
+    return {
+        "mean": float(load.mean(view.agent)[row]),
+        "mean_bytes": float(view.bytes_of(load).mean[row]),
+        "metric": shown.metric.name,
+        "unit": shown.unit,
+        "quantity": p.quantity,
+        "method": p.method,
+        "accuracy_nature": p.nature,
+        "accuracy": float(accuracy.values[row]),
+        "accuracy_standard_error_at_most": None if accuracy.error is None else float(accuracy.error[row]),
+    }
 
 
 def load_json(view: LoadView) -> dict[str, Any]:

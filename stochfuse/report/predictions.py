@@ -21,18 +21,7 @@ from stochfuse.prediction.quantities import OVERCONFIDENT, expectation, noun, ti
 from stochfuse.prediction.quantities import unit as unit_of
 from stochfuse.prediction.result import Limit, Prediction
 from stochfuse.prediction.swept import Swept
-from stochfuse.report.plot import (
-    DASHES,
-    MARKERS,
-    MOST_MARKED,
-    band,
-    below,
-    canvas,
-    direct,
-    entry,
-    labelled,
-    titled,
-)
+from stochfuse.report.plot import DASHES, MARKERS, MOST_MARKED, band, below, canvas, direct, entry, labelled, titled
 from stochfuse.report.rows import ResultRows, ShownCurve, whose
 from stochfuse.report.table import Report, Table, counted, listed, number, stamped, to_csv
 from stochfuse.scenario.registry import OPTIMAL, SIMPLIFIED

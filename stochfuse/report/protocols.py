@@ -13,7 +13,7 @@ from stochfuse.kalman.metrics import Metric
 from stochfuse.prediction import quantities
 from stochfuse.report.plot import COLORS, MARKERS, below, canvas, labelled, titled
 from stochfuse.report.rows import ResultRows
-from stochfuse.report.table import Report, Table, number, stamped, to_csv
+from stochfuse.report.table import Report, Table, number, records_csv, stamped
 from stochfuse.scenario import registry
 
 SCHEMA = "stochfuse.messages/1"
@@ -101,22 +101,24 @@ def _cell(shown: SampledLoad, row: int, digits: int) -> str:
 
 
 def _csv(view: ProtocolView) -> str:
-    headings = ["protocol", "missing", "estimator", "nature", "runs", "agent", *view.rows.headings]
-    headings += ["from_step", "to_step"]
-    for name in ("nodes", "bytes", "apart"):
-        headings += [name, f"{name}_standard_error"]
-    headings += [] if view.metric is None else ["metric", "quantity", "accuracy", "accuracy_standard_error"]
-    rows, f = [], view.found
+    records, f = [], view.found
     first, last = map(int, f.steps[[0, -1]])
     for p, name in enumerate(f.protocols):
-        loads, accuracy = [f.load(p, what, view.agent) for what in ("nodes", "bytes", "apart")], view.accuracy(p)
+        sampled = {what: f.load(p, what, view.agent) for what in ("nodes", "bytes", "apart")}
         for row in range(len(f.link)):
-            cells = [name, f.missing, f.estimator, "sampled", f.runs, view.agent, *view.rows.record(row), first, last]
-            cells += [float(part[row]) for each in loads for part in each]
+            record = {"protocol": name, "missing": f.missing, "estimator": f.estimator, "nature": "sampled"}
+            record |= {"runs": f.runs, "agent": view.agent}
+            record |= dict(zip(view.rows.headings, view.rows.record(row), strict=True))
+            record |= {"from_step": first, "to_step": last}
+            accuracy = view.accuracy(p)
+            for what, each in sampled.items():
+                record |= {what: float(each.values[row]), f"{what}_standard_error": float(each.error[row])}
             if accuracy is not None and view.metric is not None:
-                cells += [view.metric.name, view.quantity, *(float(part[row]) for part in accuracy)]
-            rows.append(tuple(cells))
-    return to_csv(headings, rows)
+                record |= {"metric": view.metric.name, "quantity": view.quantity}
+                record |= {"accuracy": float(accuracy.values[row])}
+                record |= {"accuracy_standard_error": float(accuracy.error[row])}
+            records.append(record)
+    return records_csv(tuple(records[0]), records)
 
 
 def _json(view: ProtocolView) -> dict[str, Any]:
