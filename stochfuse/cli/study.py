@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stochfuse.cli.options import OUTPUT, SHOWN, WORK, Beside, choice, named_once, option, refuse, tell
-from stochfuse.cli.progress import patient, quiet
+from stochfuse.cli.progress import known_long, quiet
 from stochfuse.engines.progress import Progress, listener, listening
 from stochfuse.errors import UsageError
 
@@ -169,7 +169,7 @@ def _progress() -> StudyProgress:
     from stochfuse.studies.running import StudyProgress
 
     shown = listener()
-    patient(SILENCE)
+    known_long(SILENCE)
 
     class Points(StudyProgress):
         def begin(self, points: int, done: int, what: str) -> None:

@@ -25,7 +25,7 @@ def run_report(found: RunResult, digits: int = 5) -> Report:
 def _titles(found: RunResult) -> tuple[str, ...]:
     network, metric = found.scenario.network, found.metric
     unit = f" [{metric.unit}]" if metric.unit else ""
-    arrivals = "arrivals drawn from the links" if found.drawn else "arrivals as recorded"
+    arrivals = "arrivals drawn from the links" if found.drawn or found.simulated else "arrivals as recorded"
     runs = f"{counted(found.runs, 'run')} of {network.steps:,} steps"
     truth = any(row.realised is not None for row in found.rows)
     return (
