@@ -32,33 +32,62 @@ from stochfuse.errors import UsageError
 from stochfuse.scenario.registry import CRITERIA, ESTIMATORS, LFG
 
 if TYPE_CHECKING:
-    from stochfuse.data.run import RunResult
+    from stochfuse.data.run import RunResult, Way
+    from stochfuse.scenario.scenario import Scenario
 
 EXAMPLES = (
     "stochfuse run my.toml --measurements z.csv --arrivals heard.csv --truth x.csv",
     "stochfuse run my.toml --measurements z.csv --link 0.5 --estimator optimal",
     "stochfuse run utias --data mrclam --link 0:1:0.25 --estimator split-ci,itns",
 )
-EstimatorsOption = Annotated[
-    str | None,
-    option(
-        f"One or several: {', '.join(ESTIMATORS[:3])}, … (stochfuse methods), or your own, module:Class; default: the "
-        f"scenario's, else {LFG}.",
-        WORK,
-        "--estimator",
-        metavar="LIST",
-        autocompletion=completed(ESTIMATORS),
-    ),
-]
-CaseOption = Annotated[
-    str | None, option("Arrivals are drawn from the links of this case.", NETWORK + RARE, metavar="NAME")
-]
-CriterionOption = Annotated[
-    str,
-    option(
-        f"intersections: what the weights minimise, {', '.join(CRITERIA)}; default: det.", WORK + RARE, metavar="NAME"
-    ),
-]
+
+
+@dataclass(frozen=True)
+class Estimating:
+    """Which estimators are run, on which arrivals, and how their errors are measured."""
+
+    case: Annotated[
+        str | None, option("Arrivals are drawn from the links of this case.", NETWORK + RARE, metavar="NAME")
+    ] = None
+    estimator: Annotated[
+        str | None,
+        option(
+            f"One or several: {', '.join(ESTIMATORS[:3])}, … (stochfuse methods), or your own, module:Class; default: "
+            f"the scenario's, else {LFG}.", WORK, "--estimator", metavar="LIST", autocompletion=completed(ESTIMATORS),
+        ),
+    ] = None  # fmt: skip
+    criterion: Annotated[
+        str,
+        option(
+            f"intersections: what the weights minimise, {', '.join(CRITERIA)}; default: det.", WORK + RARE,
+            metavar="NAME",
+        ),
+    ] = "det"  # fmt: skip
+    metric: MetricOption = None
+
+    @property
+    def names(self) -> tuple[str, ...] | None:
+        """Names of the estimators, if any are asked for."""
+        return None if self.estimator is None else named(self.estimator)
+
+    def way(self, given: Scenario, links: list[float] | None, seed: int) -> Way:
+        """Return how records of a scenario are run; links are what --link asks for.
+
+        Raises
+        ------
+        UsageError
+            If there are several links, or a case beside them.
+        """
+        from stochfuse.data.run import Way
+
+        if self.case is not None and links is not None:
+            raise UsageError("--case: expected no --link beside it, got both")
+        if links is not None and len(links) > 1:
+            raise UsageError(f"--link: expected one link probability, got {len(links)}")
+        link = self.case if links is None else links[0]
+        return Way(self.names or (given.estimator or LFG,), link, seed, self.criterion)
+
+
 ROBOTS = "utias"
 """What stands for a scenario where robots' records are run."""
 
@@ -135,10 +164,7 @@ def run(
     changes: Changes = Changes(),
     robots: RobotOptions = RobotOptions(),
     seed: Annotated[int, option("Of arrivals that are drawn; default: 1.", NETWORK, min=0, metavar="N")] = 1,
-    case: CaseOption = None,
-    estimator: EstimatorsOption = None,
-    criterion: CriterionOption = "det",
-    metric: MetricOption = None,
+    estimating: Estimating = Estimating(),
     to: Estimates = Estimates(),
 ) -> None:  # fmt: skip
     """Run estimators on measurements; show realised, claimed and predicted errors, and whether claims are consistent.
@@ -146,16 +172,16 @@ def run(
     Sensors by name are measured by their true functions: the filters are extended ones.
     """
     from stochfuse.data.records import read_records
-    from stochfuse.data.run import Way, run_records
+    from stochfuse.data.run import run_records
     from stochfuse.data.writing import EstimatesFile
     from stochfuse.kalman.metrics import metric as metric_of
 
-    names = None if estimator is None else named(estimator)
+    names, metric = estimating.names, estimating.metric
     if scenario == ROBOTS:
         others = {
             "measurements": measurements, "arrivals": arrivals, "truth": truth, "initial": initial, "columns": columns,
-            "output": to.output, "criterion": None if criterion == "det" else criterion, "covariance": to.covariance,
-            **vars(replace(changes, link=None)),
+            "output": to.output, "criterion": None if estimating.criterion == "det" else estimating.criterion,
+            "case": estimating.case, "covariance": to.covariance, **vars(replace(changes, link=None)),
         }  # fmt: skip
         check_robots(robots, others, metric)
         to.check()
@@ -173,7 +199,7 @@ def run(
     first = initial or beside(measurements)
     records = read_records(given, measurements, arrivals, truth, first, renamed(columns, "OURS=THEIRS"))
     chosen = metric_of(metric or given.metric or "trace", given.model)
-    way = Way(names or (given.estimator or LFG,), one_link(links, case), seed, criterion)
+    way = estimating.way(given, links, seed)
     writing: Any = nullcontext()
     if to.output is not None:
         writing = EstimatesFile(to.output, records.scenario, truth=truth is not None, covariance=to.covariance)
@@ -218,17 +244,6 @@ def show(found: RunResult, to: Beside) -> None:
     said = tell(f"note: {note}" for note in (*found.notes, *(suspicion.text for suspicion in found.suspicions)))
     to.write(report)
     to.send(report, found.scenario.to_mapping(), said)
-
-
-def one_link(links: list[float] | None, case: str | None = None) -> float | str | None:
-    """Return the one link probability, or the case of the scenario, that was asked for, if any."""
-    if case is not None and links is not None:
-        raise UsageError("--case: expected no --link beside it, got both")
-    if case is not None:
-        return case
-    if links is not None and len(links) > 1:
-        raise UsageError(f"--link: expected one link probability, got {len(links)}")
-    return None if links is None else links[0]
 
 
 def beside(measurements: str) -> str | None:

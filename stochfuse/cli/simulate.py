@@ -12,16 +12,13 @@ from stochfuse.cli.options import (
     WORK,
     Beside,
     Changes,
-    MetricOption,
     ScenarioArgument,
     check_files,
-    named,
     option,
     tell,
 )
-from stochfuse.cli.run import CaseOption, CriterionOption, EstimatorsOption, one_link, show
+from stochfuse.cli.run import Estimating, show
 from stochfuse.errors import UsageError
-from stochfuse.scenario.registry import LFG
 
 EXAMPLES = (
     "stochfuse simulate thesis-steady --link 0.5 --steps 4 --runs 200 -o folder",
@@ -54,10 +51,7 @@ def simulate(
     changes: Changes = Changes(),
     runs: Annotated[int, option("Independent runs; default: 1.", WORK, min=1, metavar="N")] = 1,
     seed: Annotated[int, option("Of all random numbers; default: 1.", WORK, min=0, metavar="N")] = 1,
-    case: CaseOption = None,
-    estimator: EstimatorsOption = None,
-    criterion: CriterionOption = "det",
-    metric: MetricOption = None,
+    estimating: Estimating = Estimating(),
     to: Files = Files(),
 ) -> None:
     """Draw truth, measurements and arrivals, run estimators on them, and lay their errors beside the prediction.
@@ -67,16 +61,13 @@ def simulate(
     """
     from stochfuse.data.simulate import simulate as simulated
 
-    names = None if estimator is None else named(estimator)
     to.check(scenario)
     given, links = changes.of(scenario)
-    way = {
-        "estimator": names or (given.estimator or LFG,),
-        "link": one_link(links, case),
-        "seed": seed,
-        "criterion": criterion,
-    }
-    found = simulated(given, runs, metric=metric, folder=to.output, force=to.force, **way)
+    way, metric = estimating.way(given, links, seed), estimating.metric
+    found = simulated(
+        given, runs, estimator=way.estimators, link=way.link, criterion=way.criterion, metric=metric, seed=seed,
+        folder=to.output, force=to.force,
+    )  # fmt: skip
     show(found, to)
     if to.output is not None:
         files = " ".join(f"--{name} {to.output / f'{name}.csv'}" for name in ("measurements", "arrivals", "truth"))
