@@ -23,7 +23,6 @@ from stochfuse.cli.options import (
     option,
     quantity_names,
     refuse,
-    settings_for,
     steps_at,
     tell,
     whose,
@@ -89,7 +88,7 @@ def predict(
         unknown = {"--metric": metric, "--steady": steady, "--interval": interval}
         refuse(several | unknown, f"without --quantity {STATE}")
         way = method or (SIMPLIFIED if estimator is None else GENERAL)
-        settings = settings_for([way], estimator=estimator, **vars(averaging))
+        settings = averaging.settings([way], estimator=estimator)
         _states(scenario, changes, measurements, StatesAsked(way, agent, at), settings, to)
         return
     if measurements is not None:

@@ -52,9 +52,9 @@ def derivation(form: SimplifiedForm | GeneralForm) -> Derivation:
         "symbols": ["mu", *map(str, form.symbols)],
     }
     if isinstance(form, GeneralForm):
-        return Derivation(_general_title(form), _general_formulas(form), facts, _latex_names(form.step))
+        return Derivation(_title(form), _general_formulas(form), facts, _latex_names(form.step))
     priors = {str(name): _latex_prior(str(name)) for name, _ in form.chain if str(name).endswith("_prior")}
-    return Derivation(_simplified_title(form), _simplified_formulas(form), facts, _latex_names(form.step) | priors)
+    return Derivation(_title(form), _simplified_formulas(form), facts, _latex_names(form.step) | priors)
 
 
 def _agents(n: int) -> str:
@@ -65,28 +65,28 @@ _METHODS = {LFG: GENERAL, NAIVE: NAIVE, OPTIMAL: OPTIMAL}
 _SYMBOLS = "mu: link probability, q, r: process and measurement noise variance, p0: variance of the initial estimates"
 
 
-def _simplified_title(form: SimplifiedForm) -> str:
+def _title(form: SimplifiedForm | GeneralForm) -> str:
+    if isinstance(form, SimplifiedForm):
+        what, quantity, exact = (
+            "Simplified formulation (54)",
+            "claimed posterior covariance P_k",
+            "approximate: mean field",
+        )
+        agents = _agents(form.agents)
+    else:
+        rule = "naive fusion (42)/(43)" if form.estimator == NAIVE else "the Local Fusion Graph"
+        what, exact = f"General formulation (49) of {rule}", "exact: every outcome"
+        quantity = f"{form.quantity} posterior covariance P_k"
+        agents = f"{_agents(form.agents)}, {form.architecture}"
+        if form.estimator == OPTIMAL:
+            what, exact = "Contact chain", "exact: every path; the best that linear fusion can do"
+            quantity = f"{OPTIMAL} posterior covariance P_k"
+        elif form.quantity == RMS:
+            quantity = "squared posterior error M_k (noise, and the bias from the initial error b)"
     start = "shared" if form.shared else "independent"
     return (
-        f"Simplified formulation (54), {_agents(form.agents)}, scalar state with F = G = H = 1, {start} "
-        f"initial estimates: "
-        f"expected claimed posterior covariance P_k after step k (approximate: mean field). {_SYMBOLS}"
-    )
-
-
-def _general_title(form: GeneralForm) -> str:
-    start = "shared" if form.shared else "independent"
-    rule = "naive fusion (42)/(43)" if form.estimator == NAIVE else "the Local Fusion Graph"
-    what, exact = f"General formulation (49) of {rule}", "every outcome"
-    quantity = f"{form.quantity} posterior covariance P_k"
-    if form.estimator == OPTIMAL:
-        what, exact = "Contact chain", "every path; the best that linear fusion can do"
-        quantity = f"{OPTIMAL} posterior covariance P_k"
-    elif form.quantity == RMS:
-        quantity = "squared posterior error M_k (noise, and the bias from the initial error b)"
-    return (
-        f"{what}, {_agents(form.agents)}, {form.architecture}, scalar state with F = G = H = 1, {start} initial "
-        f"estimates: expected {quantity} after step k (exact: {exact}). {_SYMBOLS}"
+        f"{what}, {agents}, scalar state with F = G = H = 1, {start} initial estimates: expected {quantity} "
+        f"after step k ({exact}). {_SYMBOLS}"
     )
 
 
