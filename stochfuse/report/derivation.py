@@ -67,12 +67,8 @@ _SYMBOLS = "mu: link probability, q, r: process and measurement noise variance, 
 
 def _title(form: SimplifiedForm | GeneralForm) -> str:
     if isinstance(form, SimplifiedForm):
-        what, quantity, exact = (
-            "Simplified formulation (54)",
-            "claimed posterior covariance P_k",
-            "approximate: mean field",
-        )
-        agents = _agents(form.agents)
+        what, exact = "Simplified formulation (54)", "approximate: mean field"
+        quantity, agents = "claimed posterior covariance P_k", _agents(form.agents)
     else:
         rule = "naive fusion (42)/(43)" if form.estimator == NAIVE else "the Local Fusion Graph"
         what, exact = f"General formulation (49) of {rule}", "exact: every outcome"

@@ -124,8 +124,7 @@ def least_link_sheet(found: LeastLink, digits: int = 5) -> SolutionSheet:
     else:
         answer = [f"Least link probability: µ = {number(µ, PRECISE)}, from which on {at_most}"]
     if found.met != ((µ, 1.0),):
-        spans = "; ".join(f"from {a:.9g} to {b:.9g}" for a, b in found.met)
-        answer = [answer[0].replace(", from which on", ", where"), f"It does not stay so: met for µ {spans} only"]
+        answer = [answer[0].replace(", from which on", ", where"), f"It does not stay so: met for µ {_met(found)} only"]
     certain = "certain within" if np.isfinite(found.bound) and found.proof != "scan" else "by rounding within"
     reason = PROOFS[found.proof] + (f"; {certain} {sure:.1g} in µ" if sure else "") + _bounded(found.bound)
     answer.append(reason[0].upper() + reason[1:])
@@ -177,8 +176,7 @@ def value_sheet(found: LeastValue, digits: int = 5) -> SolutionSheet:
     which = "at and above which" if found.direction == "least" else "at and below which"
     lines = [f"{found.direction.capitalize()} {found.key}: {at}, {which if single else 'where'} {at_most}"]
     if not single:
-        spans = "; ".join(f"from {a:.9g} to {b:.9g}" for a, b in found.met)
-        lines.append(f"Met for {found.key} {spans}")
+        lines.append(f"Met for {found.key} {_met(found)}")
     proof = VALUE_PROOFS[found.proof].format(n=found.grid.shape[1])
     if found.beside is None:
         proof += "; no value of the range misses the target on that side"
@@ -219,6 +217,10 @@ def value_sheet(found: LeastValue, digits: int = 5) -> SolutionSheet:
     record = (*where, found.direction, found.proof, found.value, missed)
     table = (RESULT, VALUE, tuple(rows))
     return SolutionSheet("least-value", asked, found.prediction, tuple(lines), *table, headings, (record,), facts)
+
+
+def _met(found: LeastLink | LeastValue) -> str:
+    return "; ".join(f"from {a:.9g} to {b:.9g}" for a, b in found.met)
 
 
 def _key(found: LeastValue) -> str:
