@@ -18,14 +18,9 @@ from stochfuse.cli.options import (
     Reported,
     ScenarioArgument,
     completed,
-    named,
     option,
-    quantity_names,
-    refuse,
-    steps_at,
-    tell,
-    whose,
 )
+from stochfuse.cli.values import named, quantity_names, refuse, steps_at, tell, whose
 from stochfuse.errors import UsageError
 from stochfuse.scenario.registry import ESTIMATORS, GENERAL, INTERSECTIONS, METHODS, MONTE_CARLO, NAIVE, SIMPLIFIED
 

@@ -17,9 +17,8 @@ from stochfuse.cli.options import (
     ScenarioArgument,
     choice,
     option,
-    renamed,
-    tell,
 )
+from stochfuse.cli.values import renamed, tell
 from stochfuse.errors import UsageError
 from stochfuse.scenario.registry import GENERAL, METHODS, MONTE_CARLO, SIMPLIFIED
 

@@ -19,9 +19,8 @@ from stochfuse.cli.options import (
     completed,
     one_of,
     option,
-    options_for,
-    tell,
 )
+from stochfuse.cli.values import options_for, tell
 from stochfuse.errors import UsageError
 from stochfuse.scenario.registry import AS_FORMULAS, CLAIMED, GENERAL, LFG, NAIVE, OPTIMAL, SIMPLIFIED
 

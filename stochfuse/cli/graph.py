@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from stochfuse.cli.options import OUTPUT, SHOWN, OutputOption, PlotOption, check_files, choice, option
+from stochfuse.cli.options import OUTPUT, SHOWN, OutputOption, PlotOption, choice, option
+from stochfuse.cli.values import check_files
 from stochfuse.errors import UsageError
 
 TEXT, DOT, JSON = FORMATS = ("text", "dot", "json")

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from stochfuse.cli.options import NETWORK, OUTPUT, SHOWN, Written, option, refuse, renamed, steps_at, tell
+from stochfuse.cli.options import NETWORK, OUTPUT, SHOWN, Written, option
+from stochfuse.cli.values import refuse, renamed, steps_at, tell
 
 EXAMPLES = (
     "stochfuse links log.csv --plot links.png",

@@ -17,11 +17,8 @@ from stochfuse.cli.options import (
     Written,
     choice,
     option,
-    refuse,
-    settings_for,
-    tell,
-    whole,
 )
+from stochfuse.cli.values import refuse, settings_for, tell, whole
 from stochfuse.errors import UsageError
 from stochfuse.scenario.registry import GENERAL, LFG, MONTE_CARLO, NAIVE
 

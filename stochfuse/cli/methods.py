@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from stochfuse.cli.options import SHOWN, Listed, named, option
+from stochfuse.cli.options import SHOWN, Listed, option
+from stochfuse.cli.values import named
 from stochfuse.scenario.own_rules import OwnRule
 from stochfuse.scenario.registry import LFG
 

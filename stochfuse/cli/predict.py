@@ -21,12 +21,8 @@ from stochfuse.cli.options import (
     Reported,
     ScenarioArgument,
     option,
-    quantity_names,
-    refuse,
-    steps_at,
-    tell,
-    whose,
 )
+from stochfuse.cli.values import quantity_names, refuse, steps_at, tell, whose
 from stochfuse.errors import UsageError
 from stochfuse.scenario.registry import GENERAL, MONTE_CARLO, NAIVE, SIMPLIFIED, STATE
 

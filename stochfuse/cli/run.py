@@ -21,13 +21,9 @@ from stochfuse.cli.options import (
     MetricOption,
     ScenarioArgument,
     completed,
-    named,
     option,
-    parse_link,
-    refuse,
-    renamed,
-    tell,
 )
+from stochfuse.cli.values import named, parse_link, refuse, renamed, tell
 from stochfuse.errors import UsageError
 from stochfuse.scenario.registry import CRITERIA, ESTIMATORS, LFG
 

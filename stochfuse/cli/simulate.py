@@ -6,18 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from stochfuse.cli.options import (
-    OUTPUT,
-    RARE,
-    WORK,
-    Beside,
-    Changes,
-    ScenarioArgument,
-    check_files,
-    option,
-    tell,
-)
+from stochfuse.cli.options import OUTPUT, RARE, WORK, Beside, Changes, ScenarioArgument, option
 from stochfuse.cli.run import Estimating, show
+from stochfuse.cli.values import check_files, tell
 from stochfuse.errors import UsageError
 
 EXAMPLES = (

@@ -16,14 +16,10 @@ from stochfuse.cli.options import (
     MetricOption,
     ScenarioArgument,
     Written,
-    check_memory,
     choice,
     option,
-    over_ends,
-    settings_for,
-    tell,
-    whose,
 )
+from stochfuse.cli.values import check_memory, over_ends, settings_for, tell, whose
 from stochfuse.errors import UsageError
 from stochfuse.scenario.registry import METHODS, SIMPLIFIED
 

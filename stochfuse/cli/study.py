@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stochfuse.cli.options import OUTPUT, SHOWN, WORK, Beside, choice, named_once, option, refuse, tell
+from stochfuse.cli.options import OUTPUT, SHOWN, WORK, Beside, choice, option
 from stochfuse.cli.progress import known_long, quiet
+from stochfuse.cli.values import named_once, refuse, tell
 from stochfuse.engines.progress import Progress, listener, listening
 from stochfuse.errors import UsageError
 
