@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 from stochfuse.cli.options import (
     RARE,
@@ -11,31 +11,21 @@ from stochfuse.cli.options import (
     WORK,
     AgentOption,
     AtOption,
+    Averaging,
     Changes,
-    Graphs,
     MetricOption,
     OverOption,
-    Precisely,
     Reported,
-    Sampling,
     ScenarioArgument,
-    Weighing,
-    Written,
-    check_memory,
     completed,
-    named,
     option,
-    quantity_names,
-    settings_for,
-    steps_at,
-    tell,
-    whose,
 )
+from stochfuse.cli.values import named, quantity_names, refuse, steps_at, tell, whose
 from stochfuse.errors import UsageError
 from stochfuse.scenario.registry import ESTIMATORS, GENERAL, INTERSECTIONS, METHODS, MONTE_CARLO, NAIVE, SIMPLIFIED
 
 if TYPE_CHECKING:
-    from stochfuse.kalman.metrics import Metric
+    from stochfuse.prediction.method import ShownPart
     from stochfuse.report.table import Report
     from stochfuse.scenario.scenario import Scenario
 
@@ -86,12 +76,8 @@ def compare(
     at: AtOption = None,
     all_steps: Annotated[bool, option("Estimators: every step, not only the last.", SHOWN, "--all-steps")] = False,
     relative: Annotated[bool, option("Differences in per cent of the reference.", SHOWN, "--relative")] = False,
-    sampling: Sampling = Sampling(),
-    precisely: Precisely = Precisely(),
-    graphs: Graphs = Graphs(),
-    weighing: Weighing = Weighing(),
-    to: Written = Written(),
-    page: Reported = Reported(),
+    averaging: Averaging = Averaging(),
+    to: Reported = Reported(),
 ) -> None:
     """Show what methods predict side by side, and the signed differences; or what estimators claim and achieve.
 
@@ -102,110 +88,82 @@ def compare(
     from stochfuse.prediction.method import ShownPart
 
     to.check(scenario)
-    page.check(to.output, to.plot, scenario)
-    given, links = changes.of(scenario)
-    swept = changes.over(over, given)
-    given = swept.longest if swept else given
-    check_memory(given, links, to.kind, len(swept.points) if swept else 1)
+    given, links, swept = changes.swept(scenario, over, to.kind)
     names = None if estimator is None else [ALL] if estimator == ALL else list(named(estimator))
     if names is None and methods is None and given.estimator is not None:
         names = [ALL]  # a scenario for other estimators than those of the thesis' methods
     several = names is not None and (len(names) > 1 or methods is None or names == [ALL])
-    ways = list(DEFAULT) if methods is None else _names(methods)
+    ways = list(DEFAULT) if methods is None else [name.strip() for name in methods.split(",")]
     if several and methods is not None and len(ways) > 1:
         raise UsageError(f"--methods: expected one with several estimators, got {methods}")
-    criterion = weighing.criterion
-    settings = settings_for(
+    settings = averaging.settings(
         [GENERAL, MONTE_CARLO] if several and methods is None else ways,
         estimator=None if several or names is None else names[0],
-        **sampling._asdict(),
-        **precisely._asdict(),
-        **graphs._asdict(),
-        **weighing._asdict(),
     )
     settings |= {} if swept is None else {"over": swept}
-    for flag, given_at_all in (("--reference", reference is not None), ("--relative", relative)):
-        if several and given_at_all:
-            raise UsageError(f"{flag}: expected methods to compare, got several estimators")
-    if criterion is not None and several and names != [ALL] and not set(names or ()) & set(INTERSECTIONS):
+    if several:
+        refuse({"--reference": reference, "--relative": relative}, "methods to compare, got several estimators")
+    if averaging.criterion is not None and several and names != [ALL] and not set(names or ()) & set(INTERSECTIONS):
         raise UsageError(f"--criterion: expected estimator {' or '.join(INTERSECTIONS)}, got {estimator}")
     if all_steps and not several:
         raise UsageError("--all-steps: expected several estimators")
     quantities = quantity_names(quantity or ("claimed,actual,consistency" if several else "claimed"))
     chosen, chosen_agent = metric_of(metric or given.metric or "trace", given.model), whose(agent, given)
     steps = steps_at(at, given)
-    settings["shown"] = ShownPart(tuple(quantities), (chosen,), chosen_agent, steps)
-    shown = _Display(chosen, chosen_agent, steps, to, page)
+    part = ShownPart(tuple(quantities), (chosen,), chosen_agent, steps)
+    settings["shown"] = part
     if several:
-        only = None if names == [ALL] else names
-        _estimators(shown, given, links, only, None if methods is None else ways[0], quantities, all_steps, settings)
+        only, way = None if names == [ALL] else names, None if methods is None else ways[0]
+        report, said = _estimators((given, links), only, way, part, (all_steps, to.digits), settings)
     else:
         if len(quantities) > 1:
             raise UsageError(f"--quantity: expected one to compare methods by, got {quantity}; for several see predict")
-        _methods(shown, given, links, ways, reference, quantities[0], relative, settings)
-
-
-def _names(text: str) -> list[str]:
-    return [name.strip() for name in text.split(",")]
-
-
-class _Display(NamedTuple):
-    """How an answer is shown."""
-
-    metric: Metric
-    agent: int | str
-    steps: tuple[int, ...] | None
-    to: Written
-    page: Reported
-
-    def write(self, report: Report, scenario: Scenario, said: Sequence[str]) -> None:
-        """Write the answer, and the page."""
-        self.to.write(report)
-        self.page.write(report, scenario.to_mapping(), said)
+        report, said = _methods((given, links), ways, reference, part, (relative, to.digits), settings)
+    to.write(report)
+    to.send(report, given.to_mapping(), said)
 
 
 def _methods(
-    how: _Display,
-    scenario: Scenario,
-    links: list[float] | None,
+    asked: tuple[Scenario, list[float] | None],
     methods: Sequence[str],
     reference: str | None,
-    quantity: str,
-    relative: bool,
+    part: ShownPart,
+    look: tuple[bool, int],
     settings: dict[str, Any],
-) -> None:
+) -> tuple[Report, list[str]]:
+    """Return the report and what was said of it; `look`: whether differences are relative, and digits."""
     from stochfuse.prediction.compare import compare as run
-    from stochfuse.report import comparisons
+    from stochfuse.report.comparisons import ComparisonView, comparison_report
     from stochfuse.report.predictions import PredictionView
 
-    found = run(scenario, links, methods, reference, quantity, **settings)
-    views = tuple(
-        PredictionView(p, how.metric, how.agent, digits=how.to.digits, at=how.steps) for p in found.predictions
-    )
-    view = comparisons.ComparisonView(found, views, relative)
-    view.values()
+    relative, digits = look
+    found = run(*asked, methods, reference, part.quantities[0], **settings)
+    metric, agent, at = part.metrics[0], part.agent, part.steps
+    views = tuple(PredictionView(p, metric, agent, digits=digits, at=at) for p in found.predictions)
+    view = ComparisonView(found, views, relative)
+    view.values()  # a request that cannot be met should say so before notes
     said = tell(f"note: {prediction.method}: {note}" for prediction in found.predictions for note in prediction.notes)
-    how.write(comparisons.comparison_report(view), scenario, said)
+    return comparison_report(view), said
 
 
 def _estimators(
-    how: _Display,
-    scenario: Scenario,
-    links: list[float] | None,
+    asked: tuple[Scenario, list[float] | None],
     names: Sequence[str] | None,
     method: str | None,
-    quantities: Sequence[str],
-    all_steps: bool,
+    part: ShownPart,
+    look: tuple[bool, int],
     settings: dict[str, Any],
-) -> None:
+) -> tuple[Report, list[str]]:
+    """Return the report and what was said of it; `look`: whether every step is shown, and digits."""
     from stochfuse.prediction.compare import compare_estimators as run
     from stochfuse.prediction.quantities import check
-    from stochfuse.report import comparisons as estimators
+    from stochfuse.report.comparisons import EstimatorView, estimator_report
 
-    for name in quantities:
-        check(name, how.metric)
-    found = run(scenario, links, names, method, quantities=quantities, **settings)
-    view = estimators.EstimatorView(found, how.metric, how.agent, how.to.digits, quantities, all_steps, how.steps)
+    (metric,), (all_steps, digits) = part.metrics, look
+    for name in part.quantities:
+        check(name, metric)
+    found = run(*asked, names, method, quantities=part.quantities, **settings)
+    view = EstimatorView(found, metric, part.agent, digits, part.quantities, all_steps, part.steps)
     said = [f"note: left out: {reason}" for reason in found.left_out]
     said += [f"note: {prediction.estimator}: {note}" for prediction in found.predictions for note in prediction.notes]
     warnings = {views[0].prediction.estimator: views[0].overconfidence() for views in view.views}
@@ -214,4 +172,4 @@ def _estimators(
         said.append(f"warning: overconfident by more than 5 % somewhere: {', '.join(warnings)}")
     else:
         said += [f"warning: {name}: {warning}" for name, warning in warnings.items()]
-    how.write(estimators.estimator_report(view), scenario, tell(said))
+    return estimator_report(view), tell(said)

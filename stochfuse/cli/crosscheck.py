@@ -9,21 +9,16 @@ import typer
 from stochfuse.cli.options import (
     SHOWN,
     WORK,
+    Averaging,
     Changes,
     EstimatorOption,
-    Graphs,
     MetricOption,
-    Precisely,
     Reported,
-    Sampling,
     ScenarioArgument,
-    Weighing,
-    Written,
     choice,
     option,
-    settings_for,
-    tell,
 )
+from stochfuse.cli.values import renamed, tell
 from stochfuse.errors import UsageError
 from stochfuse.scenario.registry import GENERAL, METHODS, MONTE_CARLO, SIMPLIFIED
 
@@ -47,8 +42,7 @@ def crosscheck(
     scenario: ScenarioArgument = "thesis-transient",
     changes: Changes = Changes(),
     columns: Annotated[
-        str | None,
-        option("FILE's own names: covariance=P_trace,link=mu.", SHOWN, metavar="OURS=THEIRS"),
+        str | None, option("FILE's own names: covariance=P_trace,link=mu.", SHOWN, metavar="OURS=THEIRS")
     ] = None,
     method: Annotated[
         str | None,
@@ -62,15 +56,10 @@ def crosscheck(
     estimator: EstimatorOption = None,
     metric: MetricOption = None,
     alpha: Annotated[
-        float,
-        option("Probability to call a right simulator wrong; default: 0.001.", SHOWN, metavar="P"),
+        float, option("Probability to call a right simulator wrong; default: 0.001.", SHOWN, metavar="P")
     ] = 0.001,
-    sampling: Sampling = Sampling(),
-    precisely: Precisely = Precisely(),
-    graphs: Graphs = Graphs(),
-    weighing: Weighing = Weighing(),
-    to: Written = Written(),
-    page: Reported = Reported(),
+    averaging: Averaging = Averaging(),
+    to: Reported = Reported(),
 ) -> None:
     """Compare a simulator's results with the prediction; exit 1 if they disagree.
 
@@ -82,10 +71,7 @@ def crosscheck(
     from stochfuse.report import crosschecks
 
     to.check(file, scenario)
-    page.check(to.output, to.plot, file, scenario)
-    given = {"estimator": estimator, **sampling._asdict(), **precisely._asdict()}
-    given |= {**graphs._asdict(), **weighing._asdict()}
-    settings = settings_for([GENERAL, MONTE_CARLO] if method is None else [method], **given)
+    settings = averaging.settings([GENERAL, MONTE_CARLO] if method is None else [method], estimator=estimator)
     if not 0 < alpha < 1:
         raise UsageError(f"--alpha: expected a probability between 0 and 1, got {alpha:g}")
     if file == scenario == "-":
@@ -104,36 +90,6 @@ def crosscheck(
     to.write(report)
     said += tell(f"evidence: {text}" for text in verdict.evidence)
     said += tell(() if verdict.agrees else ["the results disagree with the prediction"])
-    page.write(report, chosen.to_mapping(), said)
+    to.send(report, chosen.to_mapping(), said)
     if not verdict.agrees:
         raise typer.Exit(1)
-
-
-def renamed(text: str | None) -> dict[str, str] | None:
-    """Return the columns of `covariance=P_trace,link=mu`; what follows a comma without = belongs to the name before.
-
-    Raises
-    ------
-    UsageError
-        If a pair is malformed or a column is named twice.
-    """
-    if text is None:
-        return None
-    pairs: list[str] = []
-    for part in text.split(","):
-        # covariance:rms:x,y=P_rms has a comma of its own
-        if pairs and "=" not in pairs[-1]:
-            pairs[-1] += f",{part}"
-        else:
-            pairs.append(part)
-    found: dict[str, str] = {}
-    for pair in pairs:
-        ours, _, theirs = (word.strip() for word in pair.partition("="))
-        if not ours or not theirs:
-            raise UsageError(
-                f"--columns: expected OURS=THEIRS such as covariance=P_trace,link=mu, got '{pair.strip()}'"
-            )
-        if ours in found:
-            raise UsageError(f"--columns: expected different columns, got {ours} twice")
-        found[ours] = theirs
-    return found

@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import sys
-from typing import Annotated
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stochfuse.cli.options import (
+    ARCHITECTURE,
     NETWORK,
     OUTPUT,
     SCENARIO,
     SHOWN,
-    ArchitectureName,
     OutputOption,
     choice,
     completed,
     one_of,
     option,
 )
+from stochfuse.cli.values import options_for, tell
 from stochfuse.errors import UsageError
 from stochfuse.scenario.registry import AS_FORMULAS, CLAIMED, GENERAL, LFG, NAIVE, OPTIMAL, SIMPLIFIED
+
+if TYPE_CHECKING:
+    from stochfuse.symbolic.general import GeneralForm
+    from stochfuse.symbolic.simplified import SimplifiedForm
 
 FORMULATIONS = (SIMPLIFIED, GENERAL, NAIVE, OPTIMAL)
 TEXT, LATEX, JSON = FORMATS = ("text", "latex", "json")
@@ -45,7 +51,7 @@ def derive(
     ] = SIMPLIFIED,
     agents: Annotated[int, option("Number of like agents; default: 3.", NETWORK, min=1, metavar="N")] = 3,
     step: Annotated[int, option("The step whose covariance is derived; default: 2.", NETWORK, min=1, metavar="K")] = 2,
-    architecture: ArchitectureName = "ad-hoc",
+    architecture: Annotated[str, ARCHITECTURE] = "ad-hoc",
     q: Number = None,
     r: Number = None,
     p0: Number = None,
@@ -87,23 +93,12 @@ def derive(
         raise UsageError("--latex and --format: expected one of them, got both")
     check_writable(output)
     from stochfuse.report import derivation
-    from stochfuse.symbolic.simplified import SimplifiedForm, derive_simplified
+    from stochfuse.symbolic.simplified import SimplifiedForm
 
-    if formulation == SIMPLIFIED:
-        if architecture == "cyclic":
-            raise UsageError("--architecture cyclic: expected formulation general, got simplified")
-        form = derive_simplified(agents, step, q, r, p0, correlation=correlation)
-    elif formulation == OPTIMAL:
-        from stochfuse.symbolic.optimal import derive_optimal
-
-        form = derive_optimal(agents, step, q, r, p0, architecture=architecture, correlation=correlation)
-    else:
-        from stochfuse.symbolic.general import derive_general
-
-        estimator = NAIVE if formulation == NAIVE else LFG
-        start = correlation
-        form = derive_general(agents, step, q, r, p0, architecture=architecture, correlation=start, estimator=estimator)
-        form = form.showing(quantity or CLAIMED, initial_error)
+    with options_for("q", "r", "p0", "initial_error"):
+        form = _form(formulation, agents, step, (q, r, p0), architecture, correlation)
+        if not isinstance(form, SimplifiedForm) and formulation != OPTIMAL:
+            form = form.showing(quantity or CLAIMED, initial_error)
     made = derivation.derivation(form)
     if latex or format == LATEX:
         text = derivation.to_latex(made)
@@ -114,9 +109,30 @@ def derive(
     else:
         text = derivation.to_plain(made)
     if isinstance(form, SimplifiedForm) and not form.expandable:
-        typer.echo(
-            f"note: step {step} is given as a chain of named sub-expressions; the expanded form would fill pages "
-            "(numbers for q, r and p0 keep it small)",
-            err=True,
+        tell(
+            [
+                f"note: step {step} is given as a chain of named sub-expressions; the expanded form would fill pages "
+                "(numbers for q, r and p0 keep it small)"
+            ]
         )
     write_text(text, output)
+
+
+def _form(
+    formulation: str, agents: int, step: int, numbers: Sequence[str | None], architecture: str, correlation: str
+) -> SimplifiedForm | GeneralForm:
+    """Return the formulas of a formulation; numbers are q, r and p0."""
+    if formulation == SIMPLIFIED:
+        if architecture == "cyclic":
+            raise UsageError("--architecture cyclic: expected formulation general, got simplified")
+        from stochfuse.symbolic.simplified import derive_simplified
+
+        return derive_simplified(agents, step, *numbers, correlation=correlation)
+    more = {"architecture": architecture, "correlation": correlation}
+    if formulation == OPTIMAL:
+        from stochfuse.symbolic.optimal import derive_optimal
+
+        return derive_optimal(agents, step, *numbers, **more)
+    from stochfuse.symbolic.general import derive_general
+
+    return derive_general(agents, step, *numbers, **more, estimator=NAIVE if formulation == NAIVE else LFG)

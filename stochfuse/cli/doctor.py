@@ -7,7 +7,7 @@ import platform
 from importlib.metadata import PackageNotFoundError, requires, version
 
 from stochfuse import __version__
-from stochfuse.cli.options import FormatOption, OutputOption, check_files, chosen_format, write_report
+from stochfuse.cli.options import Listed
 
 EXAMPLES = ("stochfuse doctor", "stochfuse doctor --format json")
 SCHEMA = "stochfuse.doctor/1"
@@ -37,11 +37,11 @@ def _version(name: str) -> str | None:
         return None
 
 
-def doctor(format: FormatOption = None, output: OutputOption = None) -> None:
+def doctor(to: Listed = Listed()) -> None:
     """Show versions, extras and threads, and what is missing with the line that installs it."""
-    from stochfuse.report.table import Report, Table, to_csv
+    from stochfuse.report.table import Report, stamped
 
-    check_files(output, None)
+    to.check()
     rows = [("stochfuse", "", __version__, ""), ("Python", "", platform.python_version(), "")]
     for name, extra in _needs():
         have = _version(name)
@@ -49,14 +49,12 @@ def doctor(format: FormatOption = None, output: OutputOption = None) -> None:
         rows.append((name, extra, have or "missing", "" if have else f"pip install '{what}'"))
     threads = {name: os.environ.get(name, "not set") for name in THREADS}
     cores = os.cpu_count()
-    machine = f"{platform.system()} {platform.machine()}, {cores} cores; threads of matrix products: " + ", ".join(
-        f"{name} {value}" for name, value in threads.items()
-    )
+    set_to = ", ".join(f"{name} {value}" for name, value in threads.items())
+    machine = f"{platform.system()} {platform.machine()}, {cores} cores; threads of matrix products: {set_to}"
     keys = ("package", "extra", "version", "to install")
     facts = [dict(zip(("package", "extra", "version", "install"), row, strict=True)) for row in rows]
-    report = Report(
-        lambda: Table(("What is installed", machine), keys, (), tuple(rows)),
-        lambda: to_csv(keys, rows),
-        lambda: {"schema": SCHEMA, "version": __version__, "cores": cores, "threads": threads, "packages": facts},
+    to.write(
+        Report.of_rows(
+            ("What is installed", machine), keys, rows, stamped(SCHEMA, cores=cores, threads=threads, packages=facts)
+        )
     )
-    write_report(report, chosen_format(format, output), output)

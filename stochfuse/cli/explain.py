@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from stochfuse.cli.options import FormatOption, OutputOption, check_files, chosen_format, completed, write_report
+from stochfuse.cli.options import Listed, completed
 
 EXAMPLES = ("stochfuse explain claimed", "stochfuse explain split-ci")
 
@@ -26,17 +26,15 @@ def explain(
             autocompletion=completed(_words),
         ),
     ] = None,
-    format: FormatOption = None,
-    output: OutputOption = None,
+    to: Listed = Listed(),
 ) -> None:
     """Explain a word that commands and outputs use, in a paragraph."""
     from stochfuse.report.explanations import explained
     from stochfuse.report.table import terminal_width, write_text
 
-    check_files(output, None)
-    kind = chosen_format(format, output)
+    to.check()
     text, report = explained(" ".join(word) if word else None, terminal_width())
-    if kind == "table":
-        write_text(text, output)
+    if to.kind == "table":
+        write_text(text, to.output)
     else:
-        write_report(report, kind, output)
+        to.write(report)

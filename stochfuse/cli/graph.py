@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from stochfuse.cli.options import OUTPUT, SHOWN, OutputOption, PlotOption, check_files, choice, option
+from stochfuse.cli.options import OUTPUT, SHOWN, OutputOption, PlotOption, choice, option
+from stochfuse.cli.values import check_files
 from stochfuse.errors import UsageError
 
 TEXT, DOT, JSON = FORMATS = ("text", "dot", "json")
@@ -47,7 +48,7 @@ def graph(
     from stochfuse.report.plot import save
     from stochfuse.report.table import terminal_width, to_json, write_text
 
-    check_files(output, plot, history, scenario or "")
+    check_files([history, scenario], output, plot)
     made = FusionGraph(load_history(history), shared=shared)
     agents = range(1, made.history.agents + 1) if agent is None else [agent]
     steps = range(1, made.history.steps + 1) if step is None else [step]

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from stochfuse.cli.options import NETWORK, OUTPUT, SHOWN, Written, option, pairs, steps_at
-from stochfuse.errors import UsageError
+from stochfuse.cli.options import NETWORK, OUTPUT, SHOWN, Written, option
+from stochfuse.cli.values import refuse, renamed, steps_at, tell
 
 EXAMPLES = (
     "stochfuse links log.csv --plot links.png",
@@ -61,23 +61,20 @@ def links(
     check_writable(write, (".toml",))
     steps = None
     if is_scenario(file):
-        for name, value in (("--columns", columns), ("--sent", sent), ("--step", step)):
-            if value is not None:
-                raise UsageError(f"{name}: expected a file of links to go with it, got a scenario")
+        of_file = {"--columns": columns, "--sent": sent, "--step": step}
+        refuse(of_file, "a file of links to go with it, got a scenario")
         scenario = load_scenario(file)
         found, steps = links_of_scenario(scenario), steps_at(at, scenario)
-    elif at is not None:
-        raise UsageError("--at: expected a scenario to go with it, got a file of links")
     else:
-        found = read_links(file, columns=pairs("--columns", columns), sent=sent, step=step)
+        refuse({"--at": at}, "a scenario to go with it, got a file of links")
+        found = read_links(file, columns=renamed(columns, "OURS=THEIRS"), sent=sent, step=step)
     if nodes is not None:
         found = found.of([node.strip() for node in nodes.split(",")])
-    for note in found.notes:
-        typer.echo(f"note: {note}", err=True)
+    tell(f"note: {note}" for note in found.notes)
     if found.unknown:
         some = ", ".join(f"{sender} to {receiver}" for receiver, sender in found.unknown[:5])
         more = f" and {len(found.unknown) - 5} more" if len(found.unknown) > 5 else ""
-        typer.echo(f"note: nothing is known of {some}{more}", err=True)
+        tell([f"note: nothing is known of {some}{more}"])
     if write is not None:
         write_text(network_table(found), write)
     to.write(links_report(found, steps))

@@ -2,32 +2,29 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
-
-import typer
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
 
 from stochfuse.cli.options import (
     RARE,
     SHOWN,
     WORK,
     Changes,
-    Graphs,
     MetricOption,
+    Outcomes,
     OverOption,
-    Sampling,
     ScenarioArgument,
     Written,
-    check_memory,
     choice,
     option,
-    settings_for,
-    whole,
 )
+from stochfuse.cli.values import refuse, settings_for, tell, whole
 from stochfuse.errors import UsageError
 from stochfuse.scenario.registry import GENERAL, LFG, MONTE_CARLO, NAIVE
 
 if TYPE_CHECKING:
     from stochfuse.questions.messages import Load
+    from stochfuse.scenario.scenario import Scenario
 
 BOTH, EXACT = "both", "exact"
 MISSING = ("wait", "intersect")
@@ -37,7 +34,8 @@ EXAMPLES = (
 )
 
 
-class Listed(NamedTuple):
+@dataclass(frozen=True)
+class LoadOptions:
     """What of the load is shown."""
 
     distribution: Annotated[
@@ -58,12 +56,7 @@ class Listed(NamedTuple):
         option("Bytes of every message beside its nodes; sets --bytes.", SHOWN + RARE, min=0, metavar="BYTES"),
     ] = None
     protocol: Annotated[
-        str | None,
-        option(
-            "Live agents instead: acknowledged, full, own, window:W, or several.",
-            SHOWN,
-            metavar="NAME",
-        ),
+        str | None, option("Live agents instead: acknowledged, full, own, window:W, or several.", SHOWN, metavar="NAME")
     ] = None
     missing: Annotated[
         str | None,
@@ -89,13 +82,11 @@ def messages(
     agent: Annotated[
         str, option("Whose load, where agents differ: mean or an agent's number; default: mean.", SHOWN, metavar="N")
     ] = "mean",
-    shown: Listed = Listed(),
+    shown: LoadOptions = LoadOptions(),
     method: Annotated[
-        str,
-        choice((EXACT, MONTE_CARLO), "exact; or monte-carlo, for networks too large for it; default: exact.", WORK),
+        str, choice((EXACT, MONTE_CARLO), "exact; or monte-carlo, for networks too large for it; default: exact.", WORK)
     ] = EXACT,
-    graphs: Graphs = Graphs(),
-    sampling: Sampling = Sampling(),
+    outcomes: Outcomes = Outcomes(),
     to: Written = Written(),
 ) -> None:
     """Tabulate message load: how many nodes new to an agent the messages of a step bring it.
@@ -108,38 +99,26 @@ def messages(
     from stochfuse.report import messages as reports
 
     to.check(scenario)
+    window = (from_step, step)
     if shown.protocol is not None:
-        other = {
-            "--over": over,
-            "--rule": rule == NAIVE,
-            "--method": method != EXACT,
-            "--distribution": shown.distribution,
-            "--cdf": shown.cdf,
-            "--header": shown.header is not None,
-        }
-        _by_protocol(scenario, changes, other, (from_step, step), agent, shown, sampling, to)
+        other = {"--over": over, "--rule": rule == NAIVE, "--method": method != EXACT}
+        other |= {"--distribution": shown.distribution, "--cdf": shown.cdf, "--header": shown.header}
+        refuse(other, "without --protocol, which samples what live agents send in bytes")
+        _by_protocol(changes.of(scenario), window, agent, shown, outcomes, to)
         return
-    if shown.missing is not None:
-        raise UsageError("--missing: expected --protocol, which it is for")
+    refuse({"--missing": shown.missing}, "--protocol, which it is for")
     kind = _kind(distribution=shown.distribution, cdf=shown.cdf, accuracy=shown.accuracy)
     if kind in ("distribution", "cdf") and (shown.bytes or shown.header is not None):
         raise UsageError(f"--{kind}: expected neither --bytes nor --header, every node has the same size")
-    for_accuracy = {
-        "--metric": shown.metric,
-        "--quantity": shown.quantity,
-        "--max-graphs": graphs.max_graphs,
-        "--prune": graphs.prune or None,
-    }
-    for flag, value in for_accuracy.items():
-        if value is not None and not shown.accuracy:
-            raise UsageError(f"{flag}: expected --accuracy, which it is for")
-    drawn = settings_for([method], **sampling._asdict())
-    averaged = settings_for([GENERAL, NAIVE] if method == EXACT else [method], **graphs._asdict())
-    given, links = changes.of(scenario)
-    swept = changes.over(over, given)
-    given = swept.longest if swept else given
-    check_memory(given, links, to.kind, len(swept.points) if swept else 1)
-    first, last = _window(given.network.steps, from_step, step)
+    graphs = {"max_graphs": outcomes.max_graphs, "prune": outcomes.prune}
+    if not shown.accuracy:
+        for_accuracy = {"--metric": shown.metric, "--quantity": shown.quantity}
+        for_accuracy |= {"--max-graphs": outcomes.max_graphs, "--prune": outcomes.prune}
+        refuse(for_accuracy, "--accuracy, which it is for")
+    drawn = settings_for([method], runs=outcomes.runs, seed=outcomes.seed)
+    averaged = settings_for([GENERAL, NAIVE] if method == EXACT else [method], **graphs)
+    given, links, swept = changes.swept(scenario, over, to.kind)
+    first, last = _window(given.network.steps, *window)
     whose = whole(agent) or agent
     wanted = [each for each in RULES if rule in (each, BOTH)]
     of_rule = {
@@ -158,13 +137,11 @@ def messages(
 
 
 def _by_protocol(
-    scenario: str,
-    changes: Changes,
-    other: dict[str, Any],
+    asked: tuple[Scenario, list[float] | None],
     window: tuple[int | None, int | None],
     agent: str,
-    shown: Listed,
-    sampling: Sampling,
+    shown: LoadOptions,
+    outcomes: Outcomes,
     to: Written,
 ) -> None:
     """What live agents send, and what it is worth to them."""
@@ -172,12 +149,9 @@ def _by_protocol(
     from stochfuse.kalman.metrics import metric as metric_of
     from stochfuse.report.protocols import ProtocolView, protocol_report
 
-    for flag, given in other.items():
-        if given:
-            raise UsageError(f"{flag}: expected without --protocol, which samples what live agents send in bytes")
-    given, links = changes.of(scenario)
+    given, links = asked
     names = [name.strip() for name in (shown.protocol or "").split(",")]
-    drawn = {name: value for name, value in sampling._asdict().items() if value is not None}
+    drawn = settings_for([MONTE_CARLO], runs=outcomes.runs, seed=outcomes.seed)
     first, last = _window(given.network.steps, *window)
     rule = given.estimator or LFG
     found = protocol_load(given, links, names, estimator=rule, missing=shown.missing or MISSING[0], **drawn)
@@ -206,7 +180,5 @@ def _window(steps: int, from_step: int | None, step: int | None) -> tuple[int, i
 
 def _note(loads: tuple[Load, ...], accuracies: tuple[Any, ...]) -> None:
     if any(each.runs is not None for each in loads):
-        typer.echo("note: the maximum of a sample is no bound; larger loads may be possible", err=True)
-    for each in accuracies:
-        for note in each.prediction.notes:
-            typer.echo(f"note: accuracy of {each.load.rule}: {note}", err=True)
+        tell(["note: the maximum of a sample is no bound; larger loads may be possible"])
+    tell(f"note: accuracy of {each.load.rule}: {note}" for each in accuracies for note in each.prediction.notes)

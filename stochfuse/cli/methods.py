@@ -4,16 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from stochfuse.cli.options import (
-    SHOWN,
-    FormatOption,
-    OutputOption,
-    check_files,
-    chosen_format,
-    named,
-    option,
-    write_report,
-)
+from stochfuse.cli.options import SHOWN, Listed, option
+from stochfuse.cli.values import named
 from stochfuse.scenario.own_rules import OwnRule
 from stochfuse.scenario.registry import LFG
 
@@ -25,8 +17,7 @@ def methods(
     estimator: Annotated[
         str | None, option("Also this rule of your own, module:Class; several: a,b.", SHOWN, metavar="LIST")
     ] = None,
-    format: FormatOption = None,
-    output: OutputOption = None,
+    to: Listed = Listed(),
 ) -> None:
     """Show what there is: estimators, engines, quantities, and what takes what.
 
@@ -34,6 +25,5 @@ def methods(
     """
     from stochfuse.report.methods import methods_report
 
-    check_files(output, None)
-    own = [name for name in named(estimator or LFG) if isinstance(name, OwnRule)]
-    write_report(methods_report(matrix, own), chosen_format(format, output), output)
+    to.check()
+    to.write(methods_report(matrix, [name for name in named(estimator or LFG) if isinstance(name, OwnRule)]))

@@ -11,27 +11,18 @@ from stochfuse.cli.options import (
     SHOWN,
     AgentOption,
     AtOption,
+    Averaging,
     Changes,
     EstimatorOption,
-    Graphs,
     MethodOption,
     MetricOption,
     OverOption,
-    Precisely,
     QuantityOption,
     Reported,
-    Sampling,
     ScenarioArgument,
-    Weighing,
-    Written,
-    check_memory,
     option,
-    quantity_names,
-    settings_for,
-    steps_at,
-    tell,
-    whose,
 )
+from stochfuse.cli.values import quantity_names, refuse, steps_at, tell, whose
 from stochfuse.errors import UsageError
 from stochfuse.scenario.registry import GENERAL, MONTE_CARLO, NAIVE, SIMPLIFIED, STATE
 
@@ -74,12 +65,8 @@ def predict(
     ] = None,
     method: MethodOption = None,
     estimator: EstimatorOption = None,
-    sampling: Sampling = Sampling(),
-    precisely: Precisely = Precisely(),
-    graphs: Graphs = Graphs(),
-    weighing: Weighing = Weighing(),
-    to: Written = Written(),
-    page: Reported = Reported(),
+    averaging: Averaging = Averaging(),
+    to: Reported = Reported(),
 ) -> None:
     """Tabulate the expected fused covariance against link probability.
 
@@ -91,35 +78,27 @@ def predict(
     from stochfuse.prediction.quantities import check
     from stochfuse.report.predictions import PredictionView, report
 
-    to.check(scenario, *([] if measurements is None else [measurements]))
-    page.check(to.output, to.plot, scenario, measurements)
+    to.check(scenario, measurements)
+    several = {"--over": over, "--normalise": normalise, "--statistic": None if statistic == "mean" else statistic}
     if quantity == STATE:
-        flags = {"--over": over, "--metric": metric, "--normalise": normalise, "--steady": steady}
-        flags |= {"--interval": interval, "--statistic": statistic != "mean"}
-        for flag, value in flags.items():
-            if value:
-                raise UsageError(f"{flag}: expected without --quantity {STATE}")
+        unknown = {"--metric": metric, "--steady": steady, "--interval": interval}
+        refuse(several | unknown, f"without --quantity {STATE}")
         way = method or (SIMPLIFIED if estimator is None else GENERAL)
-        settings = settings_for(
-            [way], **{"estimator": estimator, **sampling._asdict(), **precisely._asdict(), **graphs._asdict()}
-        )
-        _states(scenario, changes, measurements, StatesAsked(way, agent, at), settings, to, page)
+        settings = averaging.settings([way], estimator=estimator)
+        _states(scenario, changes, measurements, StatesAsked(way, agent, at), settings, to)
         return
     if measurements is not None:
         raise UsageError(f"--measurements: expected --quantity {STATE} to go with it, got {quantity}")
     quantities = quantity_names(quantity)
-    given, links = changes.of(scenario)
-    swept = changes.over(over, given)
-    given = swept.longest if swept else given
-    check_memory(given, links, to.kind, len(swept.points) if swept else 1)
+    given, links, swept = changes.swept(scenario, over, to.kind)
     chosen_agent, steps = whose(agent, given), steps_at(at, given)
     chosen = metric_of(metric or given.metric or "trace", given.model)
     for name in quantities:
         check(name, chosen)
     # an estimator without a method picks the exact engine that takes it, else sampling
     unsaid = method is None and given.method is None
-    free = unsaid and estimator is not None and precisely.precision is None
-    otherwise = GENERAL if free else SIMPLIFIED if precisely.precision is None else MONTE_CARLO
+    free = unsaid and estimator is not None and averaging.precision is None
+    otherwise = GENERAL if free else SIMPLIFIED if averaging.precision is None else MONTE_CARLO
     way = (given.method or otherwise) if method is None else method
     if statistic != "mean":
         if way not in (GENERAL, NAIVE):
@@ -130,15 +109,11 @@ def predict(
 
         for name in quantities:
             check_statistic(statistic, name, chosen)
-    given_settings = {"estimator": estimator, **sampling._asdict(), **precisely._asdict()}
-    given_settings |= {**graphs._asdict(), **weighing._asdict()}
     if interval is not None:
-        for flag, given_too in (("--normalise", normalise), ("--statistic", statistic != "mean"), ("--over", swept)):
-            if given_too:
-                raise UsageError(f"{flag}: expected without --interval")
-    asked_for = {"steady": steady, "over": swept} | ({} if interval is None else {"interval": interval})
+        refuse(several, "without --interval")
+    asked_for: dict[str, Any] = {"steady": steady, "over": swept} | ({} if interval is None else {"interval": interval})
     # a steady state may have to be sampled
-    settings = {**asked_for, **settings_for([way, *[MONTE_CARLO] * steady], **given_settings)}
+    settings = asked_for | averaging.settings([way, *[MONTE_CARLO] * steady], estimator=estimator)
     settings["shown"] = ShownPart(metrics=(chosen,), agent=chosen_agent, steps=steps)
     if swept and statistic != "mean":
         settings["one_by_one"] = True  # whose outcomes are kept
@@ -155,7 +130,7 @@ def predict(
         view.values()  # a request that cannot be met should say so before notes and figures
     said, shown = tell(_said(views)), report(views)
     to.write(shown)
-    page.write(shown, given.to_mapping(), said)
+    to.send(shown, given.to_mapping(), said)
 
 
 class StatesAsked(NamedTuple):
@@ -172,8 +147,7 @@ def _states(
     measurements: str | None,
     asked: StatesAsked,
     settings: dict[str, Any],
-    to: Written,
-    page: Reported,
+    to: Reported,
 ) -> None:
     """Show the expected state over what arrives, given one record of measurements."""
     from stochfuse.data.records import read_records
@@ -193,7 +167,7 @@ def _states(
     said = tell(f"note: {note}" for note in records.notes)
     shown = states_report(StatesView(found, agent, steps, to.digits))
     to.write(shown)
-    page.write(shown, records.scenario.to_mapping(), said)
+    to.send(shown, records.scenario.to_mapping(), said)
 
 
 def _said(views: tuple[PredictionView, ...]) -> Iterator[str]:

@@ -6,17 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stochfuse.cli.options import (
-    SCENARIO,
-    WorkersOption,
-    Written,
-    completed,
-    option,
-)
+from stochfuse.cli.options import SCENARIO, WorkersOption, Written, completed, option
 from stochfuse.errors import UsageError
 
 if TYPE_CHECKING:
-    from stochfuse.report.reproductions import Sheet
     from stochfuse.thesis import Bench
 
 
@@ -57,7 +50,8 @@ def reproduce(
     timing: 1000 Monte Carlo runs of the Local Fusion Graph took 12,000 s there, the simplified formulation 2 s; here
     the same pair, and the exact general formulation.
     """
-    from stochfuse.thesis import Bench, find, sheet
+    from stochfuse.report.reproductions import listing_report, sheet_report
+    from stochfuse.thesis import Bench, find, listing, sheet, timing
 
     if to.plot is not None and (what is None or what in SPECIAL):
         raise UsageError("--plot: expected the key of a figure, such as figure-32, to draw")
@@ -66,23 +60,16 @@ def reproduce(
         return
     to.check()
     if what is None:
-        _list(to)
+        to.write(listing_report(listing()))
     elif what == "timing":
-        _timing(to, workers)
+        to.write(timing(workers=workers).report())
     elif what == "statements":
         _statements(Bench(seed=seed), to)
     else:
         item = find(what)
         if to.plot is not None and item.panels is None:
             raise UsageError(f"--plot: {item.key.replace('-', ' ')} is a table of parameters, with nothing to draw")
-        _write_sheet(sheet(what, Bench(seed=seed)), to)
-
-
-def _list(to: Written) -> None:
-    from stochfuse.report.reproductions import listing_report
-    from stochfuse.thesis import listing
-
-    to.write(listing_report(listing()))
+        to.write(sheet_report(sheet(what, Bench(seed=seed)), to.digits))
 
 
 def _statements(bench: Bench, to: Written) -> None:
@@ -93,20 +80,9 @@ def _statements(bench: Bench, to: Written) -> None:
     to.write(findings_report(page(bench), title))
 
 
-def _timing(to: Written, workers: int | None) -> None:
-    from stochfuse.thesis import timing
-
-    to.write(timing(workers=workers).report())
-
-
-def _write_sheet(found: Sheet, to: Written) -> None:
-    from stochfuse.report.reproductions import sheet_report
-
-    to.write(sheet_report(found, to.digits))
-
-
 def _everything(bench: Bench, to: Written) -> None:
     """Write data, statements and plot of every figure and table into a directory."""
+    from stochfuse.report.reproductions import sheet_report
     from stochfuse.report.table import SUFFIXES
     from stochfuse.thesis import listing, sheet
 
@@ -119,5 +95,5 @@ def _everything(bench: Bench, to: Written) -> None:
     for key, _ in listing():
         found = sheet(key, bench)
         figure = folder / f"{key}.png" if found.panels else None
-        _write_sheet(found, Written(kind, folder / f"{key}{suffix}", figure))
+        Written(kind, folder / f"{key}{suffix}", figure).write(sheet_report(found, to.digits))
     _statements(bench, Written(kind, folder / f"statements{suffix}"))

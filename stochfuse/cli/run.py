@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,61 +16,80 @@ from stochfuse.cli.options import (
     RARE,
     SCENARIO,
     WORK,
+    Beside,
     Changes,
-    DigitsOption,
-    FormatOption,
     MetricOption,
-    PlotOption,
-    Reported,
     ScenarioArgument,
-    Written,
-    check_files,
-    chosen_format,
     completed,
-    named,
     option,
-    pairs,
-    parse_link,
-    tell,
-    write_report,
 )
+from stochfuse.cli.values import named, parse_link, refuse, renamed, tell
 from stochfuse.errors import UsageError
 from stochfuse.scenario.registry import CRITERIA, ESTIMATORS, LFG
 
 if TYPE_CHECKING:
-    from stochfuse.data.run import RunResult
+    from stochfuse.data.run import RunResult, Way
+    from stochfuse.scenario.scenario import Scenario
 
 EXAMPLES = (
     "stochfuse run my.toml --measurements z.csv --arrivals heard.csv --truth x.csv",
     "stochfuse run my.toml --measurements z.csv --link 0.5 --estimator optimal",
     "stochfuse run utias --data mrclam --link 0:1:0.25 --estimator split-ci,itns",
 )
-EstimatorsOption = Annotated[
-    str | None,
-    option(
-        f"One or several: {', '.join(ESTIMATORS[:3])}, … (stochfuse methods), or your own, module:Class; default: the "
-        f"scenario's, else {LFG}.",
-        WORK,
-        "--estimator",
-        metavar="LIST",
-        autocompletion=completed(ESTIMATORS),
-    ),
-]
-CaseOption = Annotated[
-    str | None,
-    option("Arrivals are drawn from the links of this case.", NETWORK + RARE, metavar="NAME"),
-]
-CriterionOption = Annotated[
-    str,
-    option(
-        f"intersections: what the weights minimise, {', '.join(CRITERIA)}; default: det.", WORK + RARE, metavar="NAME"
-    ),
-]
+
+
+@dataclass(frozen=True)
+class Estimating:
+    """Which estimators are run, on which arrivals, and how their errors are measured."""
+
+    case: Annotated[
+        str | None, option("Arrivals are drawn from the links of this case.", NETWORK + RARE, metavar="NAME")
+    ] = None
+    estimator: Annotated[
+        str | None,
+        option(
+            f"One or several: {', '.join(ESTIMATORS[:3])}, … (stochfuse methods), or your own, module:Class; default: "
+            f"the scenario's, else {LFG}.", WORK, "--estimator", metavar="LIST", autocompletion=completed(ESTIMATORS),
+        ),
+    ] = None  # fmt: skip
+    criterion: Annotated[
+        str,
+        option(
+            f"intersections: what the weights minimise, {', '.join(CRITERIA)}; default: det.", WORK + RARE,
+            metavar="NAME",
+        ),
+    ] = "det"  # fmt: skip
+    metric: MetricOption = None
+
+    @property
+    def names(self) -> tuple[str, ...] | None:
+        """Names of the estimators, if any are asked for."""
+        return None if self.estimator is None else named(self.estimator)
+
+    def way(self, given: Scenario, links: list[float] | None, seed: int) -> Way:
+        """Return how records of a scenario are run; links are what --link asks for.
+
+        Raises
+        ------
+        UsageError
+            If there are several links, or a case beside them.
+        """
+        from stochfuse.data.run import Way
+
+        if self.case is not None and links is not None:
+            raise UsageError("--case: expected no --link beside it, got both")
+        if links is not None and len(links) > 1:
+            raise UsageError(f"--link: expected one link probability, got {len(links)}")
+        link = self.case if links is None else links[0]
+        return Way(self.names or (given.estimator or LFG,), link, seed, self.criterion)
+
+
 ROBOTS = "utias"
 """What stands for a scenario where robots' records are run."""
 
 
-class RobotOptions(NamedTuple):
+@dataclass(frozen=True)
+class RobotOptions:
     """A record of robots that see landmarks and one another."""
 
     data: Annotated[
@@ -91,6 +111,25 @@ class RobotOptions(NamedTuple):
     white: Annotated[bool, option(f"{ROBOTS}: take what was identified for white noise.", WORK + RARE, "--white")] = (
         False
     )
+
+
+@dataclass(frozen=True)
+class Estimates(Beside):
+    """A report on standard output, and the estimates in a file."""
+
+    output: Annotated[
+        Path | None, option("Write the estimates there: .csv or .parquet.", OUTPUT, "--output", "-o", metavar="FILE")
+    ] = None
+    covariance: Annotated[bool, option("Write covariances too, cov:STATE:STATE.", OUTPUT + RARE, "--covariance")] = (
+        False
+    )
+
+    def check(self, *inputs: str | None) -> None:
+        """See `Listed.check`."""
+        from stochfuse.report.table import check_writable
+
+        check_writable(self.output, (".csv", ".parquet"))
+        super().check(*inputs)
 
 
 def run(
@@ -128,40 +167,29 @@ def run(
     changes: Changes = Changes(),
     robots: RobotOptions = RobotOptions(),
     seed: Annotated[int, option("Of arrivals that are drawn; default: 1.", NETWORK, min=0, metavar="N")] = 1,
-    case: CaseOption = None,
-    estimator: EstimatorsOption = None,
-    criterion: CriterionOption = "det",
-    metric: MetricOption = None,
-    covariance: Annotated[
-        bool, option("Write covariances too, cov:STATE:STATE.", OUTPUT + RARE, "--covariance")
-    ] = False,
-    format: FormatOption = None,
-    output: Annotated[
-        Path | None, option("Write the estimates there: .csv or .parquet.", OUTPUT, "--output", "-o", metavar="FILE")
-    ] = None,
-    plot: PlotOption = None,
-    digits: DigitsOption = 5,
-    page: Reported = Reported(),
+    estimating: Estimating = Estimating(),
+    to: Estimates = Estimates(),
 ) -> None:  # fmt: skip
     """Run estimators on measurements; show realised, claimed and predicted errors, and whether claims are consistent.
 
     Sensors by name are measured by their true functions: the filters are extended ones.
     """
     from stochfuse.data.records import read_records
-    from stochfuse.data.run import Way, run_records
+    from stochfuse.data.run import run_records
     from stochfuse.data.writing import EstimatesFile
     from stochfuse.kalman.metrics import metric as metric_of
 
-    names = None if estimator is None else named(estimator)
+    names, metric = estimating.names, estimating.metric
     if scenario == ROBOTS:
         others = {
             "measurements": measurements, "arrivals": arrivals, "truth": truth, "estimates": estimates,
-            "initial": initial, "columns": columns, "output": output, "covariance": covariance or None,
-            "criterion": None if criterion == "det" else criterion, **changes._replace(link=None)._asdict(),
+            "initial": initial, "columns": columns, "output": to.output,
+            "criterion": None if estimating.criterion == "det" else estimating.criterion,
+            "case": estimating.case, "covariance": to.covariance, **vars(replace(changes, link=None)),
         }  # fmt: skip
         check_robots(robots, others, metric)
-        check_files(None, plot)
-        show_robots(robots, changes.link, names, seed, Written(format, None, plot, digits))
+        to.check()
+        show_robots(robots, changes.link, names, seed, to)
         return
     if robots != RobotOptions():
         raise UsageError(f"--data, --landmarks, --until, --runs, --white: expected with {ROBOTS} alone, got {scenario}")
@@ -170,39 +198,34 @@ def run(
     files = [file for file in (measurements, arrivals, truth, estimates, initial) if file is not None]
     if [*files, scenario].count("-") > 1:
         raise UsageError("expected at most one file on standard input, got - for several")
-    check_estimates(output)
-    check_files(output, plot, scenario, *files)
-    page.check(output, plot, scenario, *files)
+    to.check(scenario, *files)
     given, links = changes.of(scenario)
     first = initial or beside(measurements)
-    theirs = pairs("--columns", columns)
+    theirs = renamed(columns, "OURS=THEIRS")
     records = read_records(given, measurements, arrivals, truth, first, theirs, estimates)
     chosen = metric_of(metric or given.metric or "trace", given.model)
-    way = Way(names or (given.estimator or LFG,), one_link(links, case), seed, criterion)
+    way = estimating.way(given, links, seed)
     writing: Any = nullcontext()
-    if output is not None:
-        writing = EstimatesFile(output, records.scenario, truth=truth is not None, covariance=covariance)
-    elif covariance:
+    if to.output is not None:
+        writing = EstimatesFile(to.output, records.scenario, truth=truth is not None, covariance=to.covariance)
+    elif to.covariance:
         raise UsageError("--covariance: expected --output FILE to write them to")
     with writing as file:
         found = run_records(records, chosen, way, None if file is None else file.write)
-    show(found, format, plot, digits, page)
+    show(found, to)
 
 
 def check_robots(robots: RobotOptions, others: Mapping[str, object], metric: str | None) -> None:
     """Raise UsageError if an option does not go with a record of robots, or its folder is not given."""
     if robots.data is None:
         raise UsageError(f"--data: expected a folder with a record of robots, as {ROBOTS} needs one, got none")
-    given = [name for name, value in others.items() if value is not None]
-    if given:
-        raise UsageError(f"--{given[0]}: expected a scenario, got {ROBOTS}, whose record is all in --data")
+    flags = {f"--{name}": value for name, value in others.items()}
+    refuse(flags, f"a scenario, got {ROBOTS}, whose record is all in --data")
     if metric not in (None, "rms:x,y"):
         raise UsageError(f"--metric: expected rms:x,y with {ROBOTS}, got {metric}")
 
 
-def show_robots(
-    robots: RobotOptions, link: str | None, names: tuple[str, ...] | None, seed: int, written: Written
-) -> None:
+def show_robots(robots: RobotOptions, link: str | None, names: tuple[str, ...] | None, seed: int, to: Beside) -> None:
     """Run estimators on a record of robots, and write the report."""
     from stochfuse.data.robot_filters import ESTIMATORS as TAKEN
     from stochfuse.data.robot_run import run_robots
@@ -213,38 +236,19 @@ def show_robots(
         str(robots.data), links, names or TAKEN, runs=robots.runs, seed=seed, landmarks=robots.landmarks,
         until=robots.until, noises="white" if robots.white else "identified",
     )  # fmt: skip
-    written.write(robot_report(found, min(written.digits, 3)))
+    report = robot_report(found, min(to.digits, 3))
+    to.write(report)
+    to.send(report, {})
 
 
-def show(found: RunResult, format: str | None, plot: Path | None, digits: int, page: Reported = Reported()) -> None:
+def show(found: RunResult, to: Beside) -> None:
     """Write a run's notes, report and figure."""
-    from stochfuse.report.plot import save
     from stochfuse.report.runs import run_report
 
-    report = run_report(found, digits)
+    report = run_report(found, to.digits)
     said = tell(f"note: {note}" for note in (*found.notes, *(suspicion.text for suspicion in found.suspicions)))
-    if plot is not None and report.draw is not None:
-        save(report.draw, plot)
-    write_report(report, chosen_format(format, None), None)
-    page.write(report, found.scenario.to_mapping(), said)
-
-
-def one_link(links: list[float] | None, case: str | None = None) -> float | str | None:
-    """Return the one link probability, or the case of the scenario, that was asked for, if any."""
-    if case is not None and links is not None:
-        raise UsageError("--case: expected no --link beside it, got both")
-    if case is not None:
-        return case
-    if links is not None and len(links) > 1:
-        raise UsageError(f"--link: expected one link probability, got {len(links)}")
-    return None if links is None else links[0]
-
-
-def check_estimates(output: Path | None) -> None:
-    """Raise UsageError early if estimates can never be written to a file."""
-    from stochfuse.report.table import check_writable
-
-    check_writable(output, (".csv", ".parquet"))
+    to.write(report)
+    to.send(report, found.scenario.to_mapping(), said)
 
 
 def beside(measurements: str) -> str | None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
-from typing import Annotated, Any, NamedTuple
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import typer
 
@@ -14,17 +15,15 @@ from stochfuse.cli.options import (
     NETWORK,
     OUTPUT,
     SCENARIO,
-    FormatOption,
+    Listed,
     OutputOption,
     ScenarioArgument,
     choice,
-    chosen_format,
     completed,
     gathered,
     one_of,
     option,
     presets,
-    write_report,
 )
 from stochfuse.cli.progress import quiet
 from stochfuse.errors import UsageError, nearest
@@ -73,9 +72,9 @@ architecture = "{architecture}"     # a message may reach some, not others; "bro
 """
 
 
-def list_presets(format: FormatOption = None, output: OutputOption = None) -> None:
+def list_presets(to: Listed = Listed()) -> None:
     """List the presets."""
-    from stochfuse.report.table import Report, Table, to_csv
+    from stochfuse.report.table import Report
     from stochfuse.scenario.scenario import load_scenario, preset_names
 
     keys = ("name", "agents", "steps", "states", "description")
@@ -83,16 +82,7 @@ def list_presets(format: FormatOption = None, output: OutputOption = None) -> No
     for name in preset_names():
         s = load_scenario(name)
         entries.append((name, s.network.agents, s.network.steps, ", ".join(s.model.states), s.source["description"]))
-    rows = tuple(tuple(map(str, entry)) for entry in entries)
-    write_report(
-        Report(
-            lambda: Table(("Presets",), keys, (), rows),
-            lambda: to_csv(keys, entries),
-            lambda: [dict(zip(keys, entry, strict=True)) for entry in entries],
-        ),
-        chosen_format(format, output),
-        output,
-    )
+    to.write(Report.of_rows(("Presets",), keys, entries, [dict(zip(keys, entry, strict=True)) for entry in entries]))
 
 
 def show(
@@ -135,7 +125,8 @@ def schema(
     write_text(to_json(structure.model_json_schema(by_alias=True)), output)
 
 
-class Described(NamedTuple):
+@dataclass(frozen=True)
+class Described:
     """What a new scenario is about."""
 
     model: Annotated[
@@ -178,7 +169,7 @@ def new(
     from stochfuse.report.table import check_writable, write_text
     from stochfuse.scenario.scenario import is_preset, preset_names, read_text
 
-    given = {key: value for key, value in described._asdict().items() if value is not None}
+    given = {key: value for key, value in vars(described).items() if value is not None}
     if preset is not None and given:
         raise UsageError(f"--{next(iter(given))}: expected no preset with it, got '{preset}'")
     if preset is not None and not is_preset(preset):
@@ -216,12 +207,7 @@ def _one_of_models(text: str) -> str:
 
 
 def _written(
-    model: str = "random-walk",
-    axes: int = 1,
-    noise: float = 1.0,
-    sigma: float = 10.0,
-    unit: str = "m",
-    **network: Any,
+    model: str = "random-walk", axes: int = 1, noise: float = 1.0, sigma: float = 10.0, unit: str = "m", **network: Any
 ) -> str:
     """Return a commented scenario file."""
     if not 1 <= axes <= 3:

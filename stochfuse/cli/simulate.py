@@ -2,28 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from stochfuse.cli.options import (
-    OUTPUT,
-    RARE,
-    WORK,
-    Changes,
-    DigitsOption,
-    FormatOption,
-    MetricOption,
-    PlotOption,
-    ScenarioArgument,
-    check_files,
-    named,
-    option,
-)
-from stochfuse.cli.run import CaseOption, CriterionOption, EstimatorsOption, one_link, show
+from stochfuse.cli.options import OUTPUT, RARE, WORK, Beside, Changes, ScenarioArgument, option
+from stochfuse.cli.run import Estimating, show
+from stochfuse.cli.values import check_files, tell
 from stochfuse.errors import UsageError
-from stochfuse.scenario.registry import LFG
 
 EXAMPLES = (
     "stochfuse simulate thesis-steady --link 0.5 --steps 4 --runs 200 -o folder",
@@ -31,27 +17,34 @@ EXAMPLES = (
 )
 
 
-def simulate(
-    scenario: ScenarioArgument = "thesis-transient",
-    changes: Changes = Changes(),
-    runs: Annotated[int, option("Independent runs; default: 1.", WORK, min=1, metavar="N")] = 1,
-    seed: Annotated[int, option("Of all random numbers; default: 1.", WORK, min=0, metavar="N")] = 1,
-    case: CaseOption = None,
-    estimator: EstimatorsOption = None,
-    criterion: CriterionOption = "det",
-    metric: MetricOption = None,
-    format: FormatOption = None,
+@dataclass(frozen=True)
+class Files(Beside):
+    """A report on standard output, and what was drawn in a folder."""
+
     output: Annotated[
         Path | None,
         option(
             "Folder for measurements.csv, arrivals.csv, truth.csv, initial.csv and estimates.csv.",
             OUTPUT, "--output", "-o", metavar="FOLDER",
         ),
-    ] = None,
-    force: Annotated[bool, option("Replace such files in the folder.", OUTPUT + RARE, "--force")] = False,
-    plot: PlotOption = None,
-    digits: DigitsOption = 5,
-) -> None:  # fmt: skip
+    ] = None  # fmt: skip
+    force: Annotated[bool, option("Replace such files in the folder.", OUTPUT + RARE, "--force")] = False
+
+    def check(self, *inputs: str | None) -> None:
+        """See `Listed.check`."""
+        if self.output is not None and self.output.exists() and not self.output.is_dir():
+            raise UsageError(f"--output: expected a folder, got the file {self.output}")
+        check_files(inputs, None, self.plot, self.report)
+
+
+def simulate(
+    scenario: ScenarioArgument = "thesis-transient",
+    changes: Changes = Changes(),
+    runs: Annotated[int, option("Independent runs; default: 1.", WORK, min=1, metavar="N")] = 1,
+    seed: Annotated[int, option("Of all random numbers; default: 1.", WORK, min=0, metavar="N")] = 1,
+    estimating: Estimating = Estimating(),
+    to: Files = Files(),
+) -> None:
     """Draw truth, measurements and arrivals, run estimators on them, and lay their errors beside the prediction.
 
     Sensors by name measure by their true functions, and the filters are extended ones: the realised error says how
@@ -59,19 +52,14 @@ def simulate(
     """
     from stochfuse.data.simulate import simulate as simulated
 
-    names = None if estimator is None else named(estimator)
-    if output is not None and output.exists() and not output.is_dir():
-        raise UsageError(f"--output: expected a folder, got the file {output}")
-    check_files(None, plot, scenario)
+    to.check(scenario)
     given, links = changes.of(scenario)
-    way = {
-        "estimator": names or (given.estimator or LFG,),
-        "link": one_link(links, case),
-        "seed": seed,
-        "criterion": criterion,
-    }
-    found = simulated(given, runs, metric=metric, folder=output, force=force, **way)
-    show(found, format, plot, digits)
-    if output is not None:
-        files = " ".join(f"--{name} {output / f'{name}.csv'}" for name in ("measurements", "arrivals", "truth"))
-        typer.echo(f"note: written to {output}: run the same with {files}", err=True)
+    way, metric = estimating.way(given, links, seed), estimating.metric
+    found = simulated(
+        given, runs, estimator=way.estimators, link=way.link, criterion=way.criterion, metric=metric, seed=seed,
+        folder=to.output, force=to.force,
+    )  # fmt: skip
+    show(found, to)
+    if to.output is not None:
+        files = " ".join(f"--{name} {to.output / f'{name}.csv'}" for name in ("measurements", "arrivals", "truth"))
+        tell([f"note: written to {to.output}: run the same with {files}"])

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
-
-import typer
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
 
 from stochfuse.cli.options import (
     RARE,
@@ -17,13 +16,10 @@ from stochfuse.cli.options import (
     MetricOption,
     ScenarioArgument,
     Written,
-    check_memory,
     choice,
     option,
-    over_ends,
-    settings_for,
-    whose,
 )
+from stochfuse.cli.values import check_memory, over_ends, settings_for, tell, whose
 from stochfuse.errors import UsageError
 from stochfuse.scenario.registry import METHODS, SIMPLIFIED
 
@@ -42,7 +38,8 @@ NOT_CRITICAL = ("target", "agents-needed", "sensitivity", "gain", "steady", "ove
 """Questions about a number, which has a step and a metric; whether it is bounded is the same in all of them."""
 
 
-class SolveRequest(NamedTuple):
+@dataclass(frozen=True)
+class SolveRequest:
     """Which question."""
 
     target: Annotated[
@@ -62,12 +59,10 @@ class SolveRequest(NamedTuple):
         False
     )
     steady: Annotated[
-        bool,
-        option("Ask about the steady state; alone: tabulate it over --link.", QUESTION, "--steady"),
+        bool, option("Ask about the steady state; alone: tabulate it over --link.", QUESTION, "--steady")
     ] = False
     critical: Annotated[
-        bool,
-        option("The µ above which the average stays bounded, proved.", QUESTION, "--critical"),
+        bool, option("The µ above which the average stays bounded, proved.", QUESTION, "--critical")
     ] = False
 
     @property
@@ -79,15 +74,27 @@ class SolveRequest(NamedTuple):
         UsageError
             If there is none, or several.
         """
-        return _question(
-            self.target,
-            over=bool(self.over),
-            agents_needed=self.agents_needed,
-            sensitivity=self.sensitivity,
-            gain=self.gain,
-            steady=self.steady,
-            critical=self.critical,
-        )
+        questions = ("target", "sensitivity", "gain", "critical")
+        chosen = [name for name in questions if getattr(self, name) not in (None, False)]
+        if len(chosen) > 1:
+            raise UsageError(f"expected one question a call, got --{' and --'.join(chosen)}")
+        if self.over and chosen == ["critical"]:
+            return "critical"
+        if self.over and (chosen != ["target"] or self.agents_needed):
+            got = "--agents-needed" if self.agents_needed else f"--{chosen[0]}" if chosen else "no --target"
+            raise UsageError(f"--over: expected --target X or --critical with it, got {got}")
+        if self.over:
+            return "over"
+        if self.agents_needed and chosen != ["target"]:
+            raise UsageError("--agents-needed: expected --target X and --link P with it, got no --target")
+        if self.agents_needed:
+            return "agents-needed"
+        if not chosen and not self.steady:
+            raise UsageError(
+                "expected a question: --target X (the least link probability; with --agents-needed the least number of "
+                "agents), --sensitivity, --gain, --critical, or --steady; got none"
+            )
+        return chosen[0] if chosen else "steady"
 
 
 def solve(
@@ -120,6 +127,7 @@ def solve(
 
     One question a call: --target X (with --agents-needed: the agents), one of the others, or --steady alone.
     """
+    from stochfuse.questions.question import question
     from stochfuse.report import solutions
 
     to.check(scenario)
@@ -156,7 +164,13 @@ def solve(
         key, between = over_ends(asked_for.over)
         changes.check_unset([key])
         asked |= {"key": key, "between": between}
-    sheet, found = _answer(kind, given, links, asked_for.target, case, max_agents, to.digits, asked)
+    if kind == "steady":
+        about = question(given, **asked)
+        found = about.predict(links)
+        sheet = solutions.steady_sheet(about, found, to.digits)
+    else:
+        found = _answer(kind, given, links, asked_for.target, case, max_agents, asked)
+        sheet = solutions.sheet_of(found, to.digits)
     _note(sheet)
     to.write(solutions.solution_report(sheet, found))
 
@@ -176,39 +190,6 @@ def _critical(given: Scenario, agent: str | None, over: list[str] | None) -> Rep
     return critical_report(found)
 
 
-def _question(
-    target: float | None,
-    *,
-    over: bool,
-    agents_needed: bool,
-    sensitivity: bool,
-    gain: bool,
-    steady: bool,
-    critical: bool,
-) -> str:
-    questions = {"target": target is not None, "sensitivity": sensitivity, "gain": gain, "critical": critical}
-    chosen = [name for name, wanted in questions.items() if wanted]
-    if len(chosen) > 1:
-        raise UsageError(f"expected one question a call, got --{' and --'.join(chosen)}")
-    if over and chosen == ["critical"]:
-        return "critical"
-    if over and (chosen != ["target"] or agents_needed):
-        got = "--agents-needed" if agents_needed else f"--{chosen[0]}" if chosen else "no --target"
-        raise UsageError(f"--over: expected --target X or --critical with it, got {got}")
-    if over:
-        return "over"
-    if agents_needed:
-        if chosen != ["target"]:
-            raise UsageError("--agents-needed: expected --target X and --link P with it, got no --target")
-        return "agents-needed"
-    if not chosen and not steady:
-        raise UsageError(
-            "expected a question: --target X (the least link probability; with --agents-needed the least number of "
-            "agents), --sensitivity, --gain, --critical, or --steady; got none"
-        )
-    return chosen[0] if chosen else "steady"
-
-
 def _answer(
     kind: str,
     given: Scenario,
@@ -216,33 +197,20 @@ def _answer(
     target: float | None,
     case: str | None,
     max_agents: int | None,
-    digits: int,
     asked: dict[str, Any],
-) -> tuple[SolutionSheet, Any]:
+) -> Any:
     from stochfuse.questions import agents_needed, least_link, least_value, sensitivity
-    from stochfuse.questions.question import question
-    from stochfuse.report import solutions
 
     if kind == "target":
-        found = least_link.least_link(given, target or 0.0, **asked)
-        return solutions.least_link_sheet(found, digits), found
-    if kind == "over":
-        at = None if links is None else _single(links, kind)
-        found = least_value.least_value(given, target or 0.0, link=at, **asked)
-        return solutions.value_sheet(found, digits), found
-    if kind == "agents-needed":
-        found = agents_needed.agents_needed(given, target or 0.0, _single(links, kind), max_agents=max_agents, **asked)
-        return solutions.agents_sheet(found, digits), found
-    if kind == "sensitivity":
-        at = None if links is None else _single(links, kind)
-        found = sensitivity.sensitivity(given, at, case=case, **asked)
-        return solutions.sensitivity_sheet(found, digits), found
+        return least_link.least_link(given, target or 0.0, **asked)
     if kind == "gain":
-        found = sensitivity.share_of_gain(given, links, **asked)
-        return solutions.gain_sheet(found, digits), found
-    about = question(given, **asked)
-    found = about.predict(links)
-    return solutions.steady_sheet(about, found, digits), found
+        return sensitivity.share_of_gain(given, links, **asked)
+    if kind == "agents-needed":
+        return agents_needed.agents_needed(given, target or 0.0, _single(links, kind), max_agents=max_agents, **asked)
+    at = None if links is None else _single(links, kind)
+    if kind == "over":
+        return least_value.least_value(given, target or 0.0, link=at, **asked)
+    return sensitivity.sensitivity(given, at, case=case, **asked)
 
 
 def _single(links: list[float] | None, kind: str) -> float:
@@ -253,7 +221,5 @@ def _single(links: list[float] | None, kind: str) -> float:
 
 
 def _note(sheet: SolutionSheet) -> None:
-    for note in sheet.prediction.notes:
-        typer.echo(f"note: {note}", err=True)
-    if sheet.question.metric.mixed:
-        typer.echo(f"note: {sheet.question.metric.name} adds up different units; see --metric", err=True)
+    mixed = [f"{sheet.question.metric.name} adds up different units; see --metric"] * sheet.question.metric.mixed
+    tell(f"note: {note}" for note in (*sheet.prediction.notes, *mixed))

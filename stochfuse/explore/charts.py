@@ -77,17 +77,11 @@ class Chart:
 
     def show(self, lines: Sequence[tuple[str, str, str, Line]], x: str, y: str) -> None:
         """Draw lines (name, colour, dash, line) with the labels of the axes."""
-        self._lines.data = (
-            NOTHING
-            if not lines
-            else {
-                "xs": [line.x.tolist() for *_, line in lines],
-                "ys": [line.y.tolist() for *_, line in lines],
-                "name": [name for name, *_ in lines],
-                "color": [color for _, color, *_ in lines],
-                "dash": [dash for _, _, dash, _ in lines],
-            }
-        )
+        names, colors, dashes, drawn = zip(*lines, strict=True) if lines else ((), (), (), ())
+        self._lines.data = NOTHING if not lines else {
+            "xs": [line.x.tolist() for line in drawn], "ys": [line.y.tolist() for line in drawn],
+            "name": list(names), "color": list(colors), "dash": list(dashes),
+        }  # fmt: skip
         bands = [(color, line) for _, color, _, line in lines if line.low is not None and line.high is not None]
         self._bands.data = {
             "xs": [[*line.x, *line.x[::-1]] for _, line in bands],
@@ -174,12 +168,9 @@ class NetworkChart:
         self.figure.add_tools(TapTool(renderers=[arcs, dots]))
         self.figure.add_tools(HoverTool(renderers=[arcs], tooltips=[("link", "@name"), ("µ", "@mu{0.000}")]))
         self._bar = ColorBar(
-            color_mapper=self._mu,
-            ticker=BasicTicker(desired_num_ticks=5),
-            width=8,
-            padding=4,
+            color_mapper=self._mu, ticker=BasicTicker(desired_num_ticks=5), width=8, padding=4,
             major_label_overrides={1: "µ = 1"},
-        )
+        )  # fmt: skip
         self.figure.add_layout(self._bar, "right")
 
     def show(self, picture: Picture, asked: PageInput) -> None:

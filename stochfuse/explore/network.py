@@ -12,7 +12,7 @@ import numpy as np
 from stochfuse.errors import StochfuseError
 from stochfuse.explore.state import PageInput
 from stochfuse.prediction.predict import predict
-from stochfuse.report.network_figure import BEND, LEAST
+from stochfuse.report.network_figure import LEAST, arc, circle
 from stochfuse.scenario.known_links import links_of_scenario
 from stochfuse.scenario.network import reachable
 from stochfuse.scenario.registry import SIMPLIFIED
@@ -60,10 +60,7 @@ class Picture:
 
     def arc(self, receiver: int, sender: int) -> np.ndarray:
         """Points of a link's arc, (points, 2)."""
-        start, end = self.places[sender], self.places[receiver]
-        t = np.linspace(0.0, 1.0, POINTS)[:, None]
-        middle = (start + end) / 2 + 2 * BEND * np.array([end[1] - start[1], start[0] - end[0]])
-        return (1 - t) ** 2 * start + 2 * t * (1 - t) * middle + t**2 * end
+        return arc(self.places[sender], self.places[receiver], POINTS)
 
     def width(self, pair: tuple[int, int]) -> float:
         """Width of a link's arc: the more it is worth, the wider."""
@@ -138,11 +135,7 @@ def picture(asked: PageInput) -> Picture:
             step, link = len(link), link[-1]
     np.fill_diagonal(link, np.nan)
     where = scenario.network.places
-    if where:
-        places = np.array([place[-1, :2] if place.ndim == 2 else place[:2] for place in where])
-    else:
-        angle = 2 * np.pi * np.arange(n) / n
-        places = np.stack([np.sin(angle), np.cos(angle)], axis=1)
+    places = np.array([place[-1, :2] if place.ndim == 2 else place[:2] for place in where]) if where else circle(n)
     try:
         found = predict(scenario, None if alike is None else [alike], SIMPLIFIED)
         errors = np.array([found.values(asked.measure, i + 1)[0, -1] for i in range(n)])

@@ -49,6 +49,7 @@ MOST_LOGS = 8
 WAIT = 30
 """Milliseconds that pass before a change is followed, in which others may come."""
 OWN, ALIKE = "the scenario's own", "all alike, µ below"
+WHOSE = ("mean", "worst", "best")
 QUANTITIES = ("claimed,actual", "claimed", "actual", "consistency", "bias", "rms")
 HERE = Path(__file__).parent
 
@@ -107,7 +108,7 @@ class Page:
             "estimators": CheckboxGroup(labels=list(ESTIMATORS), active=[]),
             "quantities": Select(title="Quantity", options=list(QUANTITIES), value=QUANTITIES[0]),
             "metric": TextInput(title="Metric"),
-            "agent": Select(title="Whose", options=["mean", "worst", "best"], value="mean"),
+            "agent": Select(title="Whose", options=[*WHOSE], value="mean"),
             "target": TextInput(title="Target to be met"),
         }  # fmt: skip
         self._fields, self._errors = f, {}
@@ -166,19 +167,14 @@ class Page:
         self._about = self._div("Click on a link or an agent.", {"role": "status", "aria-live": "polite"})
         self._which = Select(title="Link or agent", options=[""], value="", stylesheets=[self._sheet])
         self._on(self._which, "value", self._point)
-        self._one = Spinner(
-            title="µ of this link", low=0, high=1, step=0.05, stylesheets=[self._sheet], width=120, visible=False
-        )
+        hidden: dict[str, Any] = {"stylesheets": [self._sheet], "visible": False}
+        self._one = Spinner(title="µ of this link", low=0, high=1, step=0.05, width=120, **hidden)
         self._on(self._one, "value", self._change_link)
-        self._senses = CheckboxGroup(
-            labels=["measures"], active=[0], stylesheets=[self._sheet], visible=False, align="end"
-        )
-        self._times = Spinner(
-            title="its noise R, times", low=0.01, step=0.5, stylesheets=[self._sheet], width=120, visible=False
-        )
+        self._senses = CheckboxGroup(labels=["measures"], active=[0], align="end", **hidden)
+        self._times = Spinner(title="its noise R, times", low=0.01, step=0.5, width=120, **hidden)
         self._on(self._senses, "active", lambda on: self._change_agent((self._times.value or 1.0) if on else None))
         self._on(self._times, "value", self._change_agent)
-        self._undo = Button(label="Undo changes", stylesheets=[self._sheet], visible=False, align="end")
+        self._undo = Button(label="Undo changes", align="end", **hidden)
         self._undo.on_click(lambda _: self._undone())
         self._fields["times"], self._errors["times"] = self._times, self._div("", {"role": "alert"}, visible=False)
         for source, many in ((self._network.links, "link"), (self._network.agents, "agent")):
@@ -204,13 +200,8 @@ class Page:
             button.on_click(lambda _e, kind=kind: self._export(kind))
             buttons.append(button)
         wide: Any = {"sizing_mode": "stretch_width"}
-        return column(
-            row(self._kind, *buttons, styles={"flex-wrap": "wrap"}, **wide),
-            self._this,
-            self._saved,
-            name="this",
-            **wide,
-        )
+        above = row(self._kind, *buttons, styles={"flex-wrap": "wrap"}, **wide)
+        return column(above, self._this, self._saved, name="this", **wide)
 
     # what is asked
 
@@ -246,15 +237,12 @@ class Page:
         """
         f, base = self._fields, self._base.network
         alike = f["links"].value == ALIKE
-        agents = f["agents"].value if f["agents"].value != base.agents else None
+        sizes = ("agents", "steps", "architecture")
+        numbers: dict[str, Any] = {name: _number(name, f[name].value) for name in ("q", "r", "p0", "target")}
         asked = PageInput(
             self._given,
-            agents=agents,
-            steps=f["steps"].value if f["steps"].value != base.steps else None,
-            architecture=f["architecture"].value if f["architecture"].value != base.architecture else None,
-            q=_number("q", f["q"].value),
-            r=_number("r", f["r"].value),
-            p0=_number("p0", f["p0"].value),
+            **{name: f[name].value if f[name].value != getattr(base, name) else None for name in sizes},
+            **numbers,
             link=round(f["link"].value, 6) if alike else None,
             power=_number("power", f["power"].value) if f["power"].visible and not alike else None,
             changed=tuple(sorted(self._changed.items())),
@@ -263,7 +251,6 @@ class Page:
             quantities=tuple(f["quantities"].value.split(",")),
             metric=f["metric"].value.strip() or None,
             agent=int(f["agent"].value) if f["agent"].value.isdecimal() else f["agent"].value,
-            target=_number("target", f["target"].value),
         )
         n = asked.scenario.network.agents
         asked.measure  # noqa: B018  says what is wrong with a name
@@ -339,9 +326,8 @@ class Page:
         self._numbers.text = self._said_least.text = self._said_load.text = self._this.text = ""
         self._least.visible = False
         self._status.text = "working …"
-        for chart in (self._over, self._steps, self._load):
+        for chart in (self._over, self._steps, self._load, self._network):
             chart.figure.styles = {"opacity": "0.3"}
-        self._network.figure.styles = {"opacity": "0.3"}
 
     def _ask(self) -> None:
         """Follow what the fields ask now."""
@@ -357,12 +343,8 @@ class Page:
             return
         self.asked = asked
         self._wrong({})
-        self._fields["agent"].options = [
-            "mean",
-            "worst",
-            "best",
-            *map(str, range(1, asked.scenario.network.agents + 1)),
-        ]
+        numbers = map(str, range(1, asked.scenario.network.agents + 1))
+        self._fields["agent"].options = [*WHOSE, *numbers]
         self._fields["link"].visible = self._fields["links"].value == ALIKE
         self._work.ask(asked)
         self._ask_least()
@@ -396,9 +378,8 @@ class Page:
         """Mark the fields that are wrong, and no others."""
         for name, div in self._errors.items():
             text = messages.get(name, "")
-            div.text, div.visible = f'<span class="wrong">{_lines(text)}</span>' if text else "", bool(text)
-            widget = self._fields[name]
-            widget.css_classes = ["wrong"] if text else []
+            div.text, div.visible = _wrongly(text) if text else "", bool(text)
+            self._fields[name].css_classes = ["wrong"] if text else []
 
     # answers
 
@@ -412,9 +393,9 @@ class Page:
         if isinstance(found, Exception):
             self._refused[name] = str(found) or type(found).__name__
             self._show_about()
-        if name == "progress" and work is self._work_least:
-            return  # it has no end that would be told
         if name == "progress":
+            if work is self._work_least:
+                return  # it has no end that would be told
             self._status.text = f"quick answers are here; exact ones are coming: {escape(str(found))}"
         elif name == "done":
             self._status.text = "all answers are here"
@@ -476,7 +457,7 @@ class Page:
             self._least.location, self._least.visible = found.value, found.value is not None
             self._said_least.text = escape(found.text) + ". Drag the line, or type a target."
         else:
-            self._said_least.text = f'<span class="wrong">{_lines(str(found))}</span>'
+            self._said_least.text = _wrongly(str(found))
 
     def _show_network(self) -> None:
         picture = self._picture
@@ -576,15 +557,10 @@ class Page:
         )
 
     def _show_this(self) -> None:
-        asked = self.asked
+        asked, kind = self.asked, self._kind.active or 0
         drawn = [c.name for c in self._shown() if c.sampled]
-        makers: list[Callable[[], str]] = [
-            lambda: "\n".join(asked.commands(drawn)),
-            lambda: asked.python(drawn),
-            asked.file,
-        ]
-        text = makers[self._kind.active or 0]()
-        if self._kind.active != 2 and state.FILE in text:
+        text = asked.file() if kind == 2 else asked.python(drawn) if kind else "\n".join(asked.commands(drawn))
+        if kind != 2 and state.FILE in text:
             text = f"# {state.FILE} is what “File” shows\n{text}"
         self._this.text = f"<pre tabindex='0'>{escape(text)}</pre>"
 
@@ -653,3 +629,7 @@ def _number(field: str, text: str) -> float | None:
 
 def _lines(text: str) -> str:
     return escape(text).replace("\n", "<br>")
+
+
+def _wrongly(text: str) -> str:
+    return f'<span class="wrong">{_lines(text)}</span>'

@@ -123,12 +123,18 @@ def opened(name: str, content: bytes, logs: Mapping[str, bytes]) -> Mapping[str,
     if file not in logs:
         known = f"one that was opened here before ({', '.join(logs)})" if logs else "one that was opened here before"
         raise ScenarioError(name, [Problem("network.link.file", known, f"'{file}'")])
-    return _in_folder(file, logs[file], lambda folder, inside: with_links(_renamed(mapping, inside), name, folder))
+    return _linked(mapping, name, file, logs)
 
 
-def _renamed(mapping: Mapping[str, Any], file: str) -> dict[str, Any]:
+def _linked(mapping: Mapping[str, Any], name: str, log: str, logs: Mapping[str, bytes]) -> Mapping[str, Any]:
+    """A mapping with the links of an opened file in it."""
     network = mapping["network"]
-    return {**mapping, "network": {**network, "link": {**network.get("link", {}), "file": file}}}
+
+    def read(folder: Path, inside: str) -> Mapping[str, Any]:
+        link = {**network.get("link", {}), "file": inside}
+        return with_links({**mapping, "network": {**network, "link": link}}, name, folder)
+
+    return _in_folder(log, logs[log], read)
 
 
 def _in_folder(name: str, content: bytes, use: Any) -> Any:
@@ -164,11 +170,7 @@ def with_log(given: OpenedScenario, name: str, logs: Mapping[str, bytes]) -> Ope
     if "agent" not in given.mapping:
         network.pop("nodes", None)
         network["agents"] = len(logged(name, logs).nodes)
-    mapping = {**given.mapping, "network": network}
-    made = _in_folder(
-        name, logs[name], lambda folder, inside: with_links(_renamed(mapping, inside), given.name, folder)
-    )
-    return OpenedScenario(FILE, made)
+    return OpenedScenario(FILE, _linked({**given.mapping, "network": network}, given.name, name, logs))
 
 
 @dataclass(frozen=True)
@@ -226,9 +228,8 @@ class PageInput:
         network = made.network
         for name, number, most in (("agents", network.agents, MOST_AGENTS), ("steps", network.steps, MOST_STEPS)):
             if number > most:
-                raise UsageError(
-                    f"{name}: expected at most {most} on this page, got {number}; the command line has more"
-                )
+                more = "the command line has more"
+                raise UsageError(f"{name}: expected at most {most} on this page, got {number}; {more}")
         if self.power is not None:
             made = _loaded(OpenedScenario(self.given.name, put(made.to_mapping(), {POWER: self.power})))
         if self.changed:
@@ -325,15 +326,9 @@ class PageInput:
                 more = ["--interval", "95%"] if counted else []
                 found.append(["predict", *base, *self._along(FINE, alone), "--method", method, *more, *shown])
             for some, grid, runs in self.groups(sampled):
-                more = [
-                    "--quantity",
-                    ",".join(self.quantities),
-                    *(["--runs", str(runs)] if runs else []),
-                    "--all-steps",
-                ]
-                found.append(
-                    ["compare", *base, *self._along(grid, alone), "--estimator", ",".join(some), *more, *shown]
-                )
+                more = ["--estimator", ",".join(some), "--quantity", ",".join(self.quantities)]
+                more += [*(["--runs", str(runs)] if runs else []), "--all-steps"]
+                found.append(["compare", *base, *self._along(grid, alone), *more, *shown])
         at = ["--link", f"{self.link:.12g}"] if self.kind == "link" else []
         present = self._base(alone=not at)
         found.append(["solve", *present, "--sensitivity", *at, *shown])

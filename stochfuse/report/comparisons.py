@@ -13,14 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse import __version__
 from stochfuse.kalman.metrics import Metric
 from stochfuse.prediction.compare import Comparison, EstimatorComparison
-from stochfuse.report import predictions
-from stochfuse.report.plot import COLORS, MARKERS, below, figure_class, shades, spread, titled
-from stochfuse.report.predictions import PredictionView
+from stochfuse.report.plot import COLORS, MARKERS, MOST_MARKED, below, canvas, entry, labelled, titled
+from stochfuse.report.predictions import NOTHING, RATIO, WIDTH_95, PredictionView, plus_minus, predict_csv
 from stochfuse.report.rows import Curves
-from stochfuse.report.table import Report, Table, number, to_csv
+from stochfuse.report.table import Report, Table, listed, number, stamped, to_csv
 
 SCHEMA = "stochfuse.comparison/1"
 
@@ -92,7 +90,7 @@ def compare_table(view: ComparisonView) -> Table:
 
 def _signed(difference: float, value: float, digits: int) -> str:
     """A difference with its sign; what is no more than rounding is nothing."""
-    return f"{difference:+.{max(2, digits - 2)}g}" if abs(difference) > 1e-12 * abs(value) else "0"
+    return f"{difference:+.{max(2, digits - 2)}g}" if abs(difference) > NOTHING * abs(value) else "0"
 
 
 def _error(view: ComparisonView, method: int, row: int, step: int) -> str:
@@ -100,36 +98,21 @@ def _error(view: ComparisonView, method: int, row: int, step: int) -> str:
     if errors is None:
         return ""
     scale = 100.0 / view.values()[0, row, step] if view.relative and method else 1.0
-    return f" {predictions.plus_minus(scale * errors[row, step], scale * view.values()[method, row, step])}"
+    return f" {plus_minus(scale * errors[row, step], scale * view.values()[method, row, step])}"
 
 
 def compare_csv(view: ComparisonView) -> str:
     """One line per method, link probability and step."""
-    first = view.views[0]
-    values = view.values()
-    rows = []
+    first, rows, values = view.views[0], [], view.values()
     for m, each in enumerate(view.views):
-        errors = view.errors(m)
-        for i, there in enumerate(first.there):
-            for k in np.flatnonzero(there):
-                difference = values[m, i, k] - values[0, i, k]
-                rows.append(
-                    (
-                        each.prediction.method,
-                        each.prediction.quantity,
-                        each.prediction.stage,
-                        each.prediction.nature,
-                        first.metric.name,
-                        first.unit,
-                        first.agent,
-                        *first.rows.record(i),
-                        int(first.steps[k]),
-                        float(values[m, i, k]),
-                        float(difference),
-                        float(difference / values[0, i, k]) if values[0, i, k] else "",
-                        "" if errors is None else float(errors[i, k]),
-                    )
-                )
+        p, errors = each.prediction, view.errors(m)
+        labels = (p.method, p.quantity, p.stage, p.nature, first.metric.name, first.unit, first.agent)
+        for i, k in np.argwhere(first.there):
+            value, reference = float(values[m, i, k]), float(values[0, i, k])
+            relative = (value - reference) / reference if reference else None
+            error = None if errors is None else float(errors[i, k])
+            where = (*first.rows.record(i), int(first.steps[k]))
+            rows.append((*labels, *where, value, value - reference, relative, error))
     headings = (
         "method", "quantity", "stage", "nature", "metric", "unit", "agent", *first.rows.headings, "step", "value",
         "difference", "relative_difference", "standard_error",
@@ -139,91 +122,61 @@ def compare_csv(view: ComparisonView) -> str:
 
 def compare_json(view: ComparisonView) -> dict[str, Any]:
     """Return the object of schema stochfuse.comparison/1."""
-    p, first = view.comparison.reference, view.views[0]
-    values = view.values()
+    p, first, values = view.comparison.reference, view.views[0], view.values()
     methods = {}
     for m, each in enumerate(view.views):
         errors = view.errors(m)
         methods[each.prediction.method] = {
             "nature": each.prediction.nature,
             "description": each.how,
-            "values": predictions.listed(values[m]),
-            "difference": predictions.listed(values[m] - values[0]),
-            **({} if errors is None else {"standard_error": predictions.listed(errors)}),
+            "values": listed(values[m]),
+            "difference": listed(values[m] - values[0]),
+            **({} if errors is None else {"standard_error": listed(errors)}),
             "meta": {"notes": list(each.prediction.notes), **each.prediction.meta},
         }
-    return {
-        "schema": SCHEMA,
-        "version": __version__,
-        "quantity": p.quantity,
-        "metric": first.metric.name,
-        "reference": p.method,
+    return stamped(
+        SCHEMA,
+        quantity=p.quantity,
+        metric=first.metric.name,
+        reference=p.method,
         **first.rows.facts,
-        "steps": first.steps.tolist(),
-        "methods": methods,
-        "scenario": p.scenario.to_mapping(),
-        "meta": {"description": list(view.titles), "stage": p.stage, "unit": first.unit or None, "agent": first.agent},
-    }
+        steps=first.steps.tolist(),
+        methods=methods,
+        scenario=p.scenario.to_mapping(),
+        meta={"description": list(view.titles), "stage": p.stage, "unit": first.unit or None, "agent": first.agent},
+    )
 
 
-def draw(view: ComparisonView):
-    """Return the figure."""
-    from matplotlib.lines import Line2D
-    from matplotlib.ticker import MaxNLocator
-
+def draw(view: ComparisonView) -> Any:
+    """Return the figure: values, and beside them the differences from the reference."""
     p, first = view.comparison.reference, view.views[0]
-    values, differences = view.values(), view.differences()
+    values, differences, errors = view.values(), view.differences(), [each.errors() for each in view.views]
     curves = first.rows.curves(first.steps)
-    chosen = spread(len(curves.names))
-    figure = figure_class()(figsize=(11, 5.4), layout="constrained")
+    figure = canvas(11, 5.4)
     left, right = figure.subplots(1, 2)
-    colors = shades(len(chosen))
-    styles: list[Any] = ["-", "--", ":", "none"]
-    for m in range(len(view.views)):
-        errors = view.errors(m)
-        style: dict[str, Any] = {"linestyle": styles[m % 4], "marker": MARKERS[m], "markersize": 4}
-        for c, color in zip(chosen, colors, strict=True):
-            x, pick = curves.x[c], curves.picks[c]
-            left.plot(x, values[m][pick], color=color, **style)
-            if m and errors is None:
-                right.plot(x, differences[m][pick], color=color, **style)
-            elif m and errors is not None:
-                scale = 100.0 / values[0][pick] if view.relative else 1.0
-                bars = 1.96 * errors[pick] * scale
-                right.errorbar(x, differences[m][pick], bars, color=color, capsize=2, **style)
-    unit = f" [{first.unit}]" if first.unit else ""
-    left.set_ylabel(first.axis)
-    if np.nanmin(values) >= 0:
-        left.set_ylim(bottom=0)
-    right.axhline(0, color="0.3", linewidth=0.8)
-    right.set_ylabel(f"difference from {p.method}" + (" [%]" if view.relative else unit))
-    for axes in (left, right):
-        axes.set_xlabel(curves.label)
-        if curves.whole:
-            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axes.grid(alpha=0.3)
-    methods = [
-        Line2D(
-            [],
-            [],
-            color="0.2",
-            linestyle=styles[m % 4],
-            marker=MARKERS[m],
-            markersize=4,
-            label=f"{q.method}, {q.nature}",
-        )
-        for m, q in enumerate(view.comparison.predictions)
+    styles: list[dict[str, Any]] = [
+        {"linestyle": ("-", "--", ":", "none")[m % 4], "marker": MARKERS[m], "markersize": 4}
+        for m in range(len(view.views))
     ]
-    shown = zip(chosen, colors, strict=True)
-    steps = [Line2D([], [], color=color, linewidth=3, label=curves.names[c]) for c, color in shown]
-    below(figure, [*methods, *steps])
-    bars = "; bars: 95 % confidence" if any(view.errors(m) is not None for m in range(len(view.views))) else ""
+    for m, (style, error) in enumerate(zip(styles, errors, strict=True)):
+        for curve in curves.shown():
+            left.plot(curve.x, values[m][curve.pick], color=curve.color, **style)
+            if m:
+                scale = 100.0 / values[0][curve.pick] if view.relative else 1.0
+                bars = None if error is None else WIDTH_95 * error[curve.pick] * scale
+                right.errorbar(curve.x, differences[m][curve.pick], bars, color=curve.color, capsize=2, **style)
+    right.axhline(0, color="0.3", linewidth=0.8)
+    unit = " [%]" if view.relative else f" [{first.unit}]" if first.unit else ""
+    labelled(left, curves.label, first.axis, whole=curves.whole, zero=np.nanmin(values) >= 0)
+    labelled(right, curves.label, f"difference from {p.method}{unit}", whole=curves.whole)
+    each = zip(view.comparison.predictions, styles, strict=True)
+    below(figure, [*(entry(f"{q.method}, {q.nature}", color="0.2", **style) for q, style in each), *curves.entries()])
+    bars = "; bars: 95 % confidence" if any(error is not None for error in errors) else ""
     titled(figure, first.what + (f", {curves.at}" if curves.at else ""), first.whom + bars)
     return figure
 
 
 ESTIMATORS_SCHEMA = "stochfuse.estimators/1"
-RATIO = "actual / claimed"
 STYLES: dict[str, Any] = {"claimed": "--", "actual": "-", "consistency": "-", "bias": ":", "rms": "-."}
 
 
@@ -259,16 +212,6 @@ class EstimatorView:
             for p in self.comparison.predictions
         ]
 
-    @cached_property
-    def values(self) -> list[list[np.ndarray]]:
-        """Values shown, (links, steps), of every quantity of every estimator."""
-        return [[view.values() for view in views] for views in self.views]
-
-    @cached_property
-    def errors(self) -> list[list[np.ndarray | None]]:
-        """Their standard errors where they are sampled."""
-        return [[view.errors() for view in views] for views in self.views]
-
     @property
     def titles(self) -> tuple[str, ...]:
         """Lines that say what is shown."""
@@ -302,21 +245,14 @@ def estimator_report(view: EstimatorView) -> Report:
 def estimator_table(view: EstimatorView) -> Table:
     """Return rows of link probability, step and estimator, columns of quantities."""
     first, stepwise = view.views[0][0], view.every_step or view.at is not None
+    # a ratio's error is left out, for room
+    cells = [[each.cells(sure=each.prediction.quantity != "consistency") for each in views] for views in view.views]
     rows = []
     for i, there in enumerate(first.there):
         for k in np.flatnonzero(there)[slice(None) if stepwise else slice(-1, None)]:
-            for estimator, values, errors in zip(view.comparison.estimators, view.values, view.errors, strict=True):
-                cells = [
-                    number(value[i, k], view.digits)
-                    + (
-                        ""
-                        if error is None or quantity == "consistency"
-                        else f" {predictions.plus_minus(error[i, k], value[i, k])}"
-                    )
-                    for quantity, value, error in zip(view.quantities, values, errors, strict=True)
-                ]
-                step = (str(first.steps[k]),) if stepwise else ()
-                rows.append((*first.rows.cells(i), *step, estimator, *cells))
+            step = (str(first.steps[k]),) if stepwise else ()
+            for estimator, shown in zip(view.comparison.estimators, cells, strict=True):
+                rows.append((*first.rows.cells(i), *step, estimator, *(each[i][k] for each in shown)))
     columns = tuple("ratio" if q == "consistency" else q for q in view.quantities)
     return Table(view.titles, (*first.rows.keys, *(("k",) if stepwise else ()), "estimator"), columns, tuple(rows))
 
@@ -326,7 +262,7 @@ def estimator_csv(view: EstimatorView) -> str:
     out = []
     for estimator, views in zip(view.comparison.estimators, view.views, strict=True):
         for each in views:
-            first, *records = predictions.predict_csv(each).splitlines()
+            first, *records = predict_csv(each).splitlines()
             out += [] if out else [f"estimator,{first}"]
             out += [f"{estimator},{record}" for record in records]
     return "\n".join(out) + "\n"
@@ -334,89 +270,72 @@ def estimator_csv(view: EstimatorView) -> str:
 
 def estimator_json(view: EstimatorView) -> dict[str, Any]:
     """Return the object of schema stochfuse.estimators/1."""
-    p = view.comparison.predictions[0]
-    found = {}
-    for q, values, errors in zip(view.comparison.predictions, view.values, view.errors, strict=True):
+    first, found = view.views[0][0], {}
+    for p, views in zip(view.comparison.predictions, view.views, strict=True):
         quantities = {}
-        for name, value, error in zip(view.quantities, values, errors, strict=True):
-            quantities[name] = {"values": predictions.listed(value)}
-            if error is not None:
-                quantities[name]["standard_error"] = predictions.listed(error)
-        meta = {key: q.meta[key] for key in ("runs", "seed", "outcomes") if key in q.meta}
-        found[q.estimator] = {
-            "method": q.method,
-            "nature": q.nature,
-            "quantities": quantities,
-            "meta": {**meta, "notes": list(q.notes)},
-        }
-    return {
-        "schema": ESTIMATORS_SCHEMA,
-        "version": __version__,
-        "metric": view.metric.name,
-        **view.views[0][0].rows.facts,
-        "steps": view.views[0][0].steps.tolist(),
-        "estimators": found,
-        "scenario": p.scenario.to_mapping(),
-        "meta": {
+        for name, each in zip(view.quantities, views, strict=True):
+            errors = each.errors()
+            more = {} if errors is None else {"standard_error": listed(errors)}
+            quantities[name] = {"values": listed(each.values()), **more}
+        meta = {key: p.meta[key] for key in ("runs", "seed", "outcomes") if key in p.meta}
+        meta |= {"notes": list(p.notes)}
+        found[p.estimator] = {"method": p.method, "nature": p.nature, "quantities": quantities, "meta": meta}
+    return stamped(
+        ESTIMATORS_SCHEMA,
+        metric=view.metric.name,
+        **first.rows.facts,
+        steps=first.steps.tolist(),
+        estimators=found,
+        scenario=first.prediction.scenario.to_mapping(),
+        meta={
             "description": list(view.titles),
-            "stage": p.stage,
-            "unit": view.views[0][0].unit or None,
+            "stage": first.prediction.stage,
+            "unit": first.unit or None,
             "agent": view.agent,
             "left_out": list(view.comparison.left_out),
         },
-    }
+    )
 
 
 MOST_GROUPS = 4
 """Rows of panels, where what is swept has a second axis."""
 
 
-def draw_estimators(view: EstimatorView):
+def draw_estimators(view: EstimatorView) -> Any:
     """Return the figure: a panel for quantities with the metric's unit, one for the ratio; a row of them a group."""
-    Figure = figure_class()
-    from matplotlib.lines import Line2D
-
     axis_of = [RATIO if q == "consistency" else view.views[0][c].axis for c, q in enumerate(view.quantities)]
     panels = list(dict.fromkeys(axis_of))
     first = view.views[0][0]
     curves, cases = _drawn(first)
-    chosen = spread(len(curves.names))[:MOST_GROUPS]
-    figure = Figure(figsize=(2.0 + 4.6 * len(panels), 1.4 + 4.0 * len(chosen)), layout="constrained")
+    chosen = curves.shown()[:MOST_GROUPS]
+    figure = canvas(2.0 + 4.6 * len(panels), 1.4 + 4.0 * len(chosen))
     grid = figure.subplots(len(chosen), len(panels), squeeze=False)
-    colors = [COLORS[e % len(COLORS)] for e in range(len(view.values))]
-    for row, c in zip(grid, chosen, strict=True):
+    looks = [{"color": COLORS[e % len(COLORS)], "marker": _marker(e)} for e in range(len(view.views))]
+    for row, curve in zip(grid, chosen, strict=True):
         axes_of = dict(zip(panels, row, strict=True))
-        for e, (values, color) in enumerate(zip(view.values, colors, strict=True)):
-            for q, quantity in enumerate(view.quantities):
-                style = "" if cases else STYLES[quantity]
+        for views, look in zip(view.views, looks, strict=True):
+            for axis, quantity, each in zip(axis_of, view.quantities, views, strict=True):
                 # cases are no sequence: claimed is a hollow marker there
-                hollow = bool(cases) and quantity == "claimed"
-                axes_of[axis_of[q]].plot(
-                    curves.x[c],
-                    values[q][curves.picks[c]],
-                    color=color,
-                    linestyle=style,
-                    marker=_marker(e) if len(curves.x[c]) <= 30 else None,
-                    markersize=9 if hollow else 5,
-                    markerfacecolor="none" if hollow else color,
-                )
+                style = {**look, "linestyle": "" if cases else STYLES[quantity], "markersize": 5}
+                if cases and quantity == "claimed":
+                    style |= {"markersize": 9, "markerfacecolor": "none"}
+                if len(curve.x) > MOST_MARKED:
+                    style["marker"] = None
+                axes_of[axis].plot(curve.x, each.values()[curve.pick], **style)
         for label, axes in axes_of.items():
             _finish(axes, label, curves, cases)
             if len(chosen) > 1:
-                axes.set_title(curves.names[c], fontsize="small")
-    names = [
-        Line2D([], [], color=color, marker=_marker(e), markersize=5, label=name)
-        for e, (name, color) in enumerate(zip(view.comparison.estimators, colors, strict=True))
-    ]
-    kinds = [
-        Line2D([], [], color="0.2", linestyle=STYLES[q], label=q + " (hollow)" * (bool(cases) and q == "claimed"))
-        for q in view.quantities
-        if q != "consistency"
-    ]
-    below(figure, [*names, *kinds])
-    where = curves.at or first.rows.name(0)
-    title = f"What estimators claim and what is true, {where}; {first.whom}"
-    titled(figure, title)
+                axes.set_title(curve.name, fontsize="small")
+    each = zip(view.comparison.estimators, looks, strict=True)
+    kinds = {q: q + " (hollow)" * (bool(cases) and q == "claimed") for q in view.quantities if q != "consistency"}
+    below(
+        figure,
+        [
+            *(entry(name, markersize=5, **look) for name, look in each),
+            *(entry(name, color="0.2", linestyle=STYLES[q]) for q, name in kinds.items()),
+        ],
+    )
+    titled(figure, f"What estimators claim and what is true, {curves.at or first.rows.name(0)}; {first.whom}")
     return figure
 
 
@@ -430,10 +349,7 @@ def _drawn(first: PredictionView) -> tuple[Curves, tuple[str, ...]]:
 
 
 def _finish(axes: Any, label: str, curves: Curves, cases: Sequence[str]) -> None:
-    from matplotlib.ticker import MaxNLocator
-
-    axes.set_ylabel(label)
-    axes.grid(alpha=0.3)
+    labelled(axes, None if cases else curves.label, label, whole=curves.whole)
     if label == RATIO:
         axes.axhline(1.0, color="0.3", linewidth=0.8)
         low, high = axes.get_ylim()
@@ -442,10 +358,6 @@ def _finish(axes: Any, label: str, curves: Curves, cases: Sequence[str]) -> None
         axes.set_ylim(bottom=0)
     if cases:
         axes.set_xticks(range(len(cases)), ["\n".join(wrap(case, 16)) for case in cases], fontsize="small")
-    else:
-        axes.set_xlabel(curves.label)
-    if curves.whole:
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
 def _marker(number: int) -> str:

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse import __version__
 from stochfuse.questions.critical import Critical
-from stochfuse.report.plot import below, figure_class, titled
-from stochfuse.report.table import Report, Table, number, to_csv
+from stochfuse.report.plot import below, canvas, labelled, titled
+from stochfuse.report.table import Report, Table, number, stamped, to_csv
 
 SCHEMA = "stochfuse.critical/1"
 PRECISE = 12
@@ -69,43 +68,38 @@ def critical_csv(found: Critical) -> str:
 def critical_json(found: Critical) -> dict[str, Any]:
     """Return the object of schema stochfuse.critical/1."""
     grows = found.growing
-    return {
-        "schema": SCHEMA,
-        "version": __version__,
-        "parameter": found.name,
-        "method": "simplified",
-        "quantity": "claimed",
-        "agent": found.agent,
-        "critical": found.critical,
-        "low": found.low,
-        "high": found.high,
-        "certificate": found.certificate,
-        "agents": list(found.agents),
-        "unbounded": None
-        if grows is None
-        else {"at": found.low, "direction": grows.X.tolist(), "rank": grows.rank, "factor": grows.factor},
-        "bounded": {
+    unbounded = grows and {"at": found.low, "direction": grows.X.tolist(), "rank": grows.rank, "factor": grows.factor}
+    return stamped(
+        SCHEMA,
+        parameter=found.name,
+        method="simplified",
+        quantity="claimed",
+        agent=found.agent,
+        critical=found.critical,
+        low=found.low,
+        high=found.high,
+        certificate=found.certificate,
+        agents=list(found.agents),
+        unbounded=unbounded,
+        bounded={
             "at": found.high,
             "covariances": [proof.P.tolist() for proof in found.bounded],
             "margin": min(proof.margin for proof in found.bounded),
         },
-        "scenario": found.scenario.to_mapping(),
-        "meta": {"description": list(_titles(found))},
-    }
+        scenario=found.scenario.to_mapping(),
+        meta={"description": list(_titles(found))},
+    )
 
 
 def draw(found: Critical) -> Any:
     """Return the figure: by what factor large covariances grow in a step, against the probability."""
-    figure = figure_class()(figsize=(7.5, 5.4), layout="constrained")
+    figure = canvas(7.5, 5.4)
     axes = figure.add_subplot()
     x, growth = found.curve()
     axes.plot(x, growth, color="C0", label="growth of large covariances per step")
     axes.axhline(1.0, color="C3", linestyle="--", linewidth=1, label="neither grows nor shrinks")
     axes.plot([found.critical], [np.interp(found.critical, x, growth)], "o", color="C3", label="critical")
-    axes.set_xlabel("link probability µ" if found.name == "link" else found.name)
-    axes.set_ylabel("factor per step")
-    axes.set_ylim(bottom=0)
-    axes.grid(alpha=0.3)
+    labelled(axes, "link probability µ" if found.name == "link" else found.name, "factor per step", zero=True)
     below(figure)
     answer, _, *about = _titles(found)
     titled(figure, answer, *about)

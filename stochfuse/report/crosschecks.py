@@ -12,13 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse import __version__
 from stochfuse.data.causes import summary
 from stochfuse.data.crosscheck import Cell, Verdict
 from stochfuse.kalman.metrics import metric
-from stochfuse.report.plot import DASHES, MARKERS, below, figure_class, shades, spread, titled
-from stochfuse.report.predictions import PredictionView, counted
-from stochfuse.report.table import Report, Table, number, to_csv
+from stochfuse.report.plot import DASHES, MARKERS, below, canvas, entry, labelled, shades, spread, titled
+from stochfuse.report.predictions import PredictionView
+from stochfuse.report.table import Report, Table, counted, listed, number, records_csv, stamped
 from stochfuse.scenario.registry import OPTIMAL
 
 SCHEMA = "stochfuse.crosscheck/1"
@@ -121,22 +120,21 @@ def crosscheck_table(shown: CrosscheckView) -> Table:
     # what all have in common is said once where quantities need the room
     alike = several and len(runs) == 1
     said = (f"{counted(min(runs), 'run')} in every cell",) if alike else ()
-    rows = []
-    for cell in shown.verdict.cells:
-        rows.append(
-            (
-                *((_sense(cell, shown.senses),) if several else ()),
-                cell.link,
-                str(cell.step),
-                _agents(cell),
-                *(() if alike else (str(cell.runs),)),
-                number(cell.mean, digits),
-                f"{cell.error:.2g}",
-                number(cell.expected, digits) + (f" ±{cell.expected_error:.2g}" if cell.expected_error else ""),
-                f"{cell.z:+.2f}" if np.isfinite(cell.z) else "+∞" if cell.z > 0 else "−∞",
-                _p(cell.p) + ("" if cell.agrees else " differs"),
-            )
+    rows = [
+        (
+            *((_sense(cell, shown.senses),) if several else ()),
+            cell.link,
+            str(cell.step),
+            _agents(cell),
+            *(() if alike else (str(cell.runs),)),
+            number(cell.mean, digits),
+            f"{cell.error:.2g}",
+            number(cell.expected, digits) + (f" ±{cell.expected_error:.2g}" if cell.expected_error else ""),
+            f"{cell.z:+.2f}" if np.isfinite(cell.z) else "+∞" if cell.z > 0 else "−∞",
+            _p(cell.p) + ("" if cell.agrees else " differs"),
         )
+        for cell in shown.verdict.cells
+    ]
     return Table(
         (*shown.titles, *said),
         (*(("of",) if several else ()), "µ", "k", "agents"),
@@ -151,62 +149,59 @@ def _sense(cell: Cell, senses: Sequence[tuple[str, str]]) -> str:
     return cell.quantity if alone else f"{cell.quantity} {cell.metric}"
 
 
+COLUMNS = (
+    "link", "step", "agents", "runs", "mean", "standard_error", "expected", "z", "p_corrected", "verdict",
+    "quantity", "metric", "column", "expected_standard_error",
+)  # fmt: skip
+
+
+def _record(cell: Cell) -> dict[str, Any]:
+    """A cell as JSON has it; a z-score that is infinite is null."""
+    return {
+        "link": _value(cell.link),
+        "step": cell.step,
+        "agents": list(cell.agents),
+        "runs": cell.runs,
+        "mean": cell.mean,
+        "standard_error": cell.error,
+        "expected": cell.expected,
+        "z": listed(cell.z),
+        "p_corrected": cell.p,
+        "agrees": cell.agrees,
+        "quantity": cell.quantity,
+        "metric": cell.metric,
+        "column": cell.column,
+        "expected_standard_error": cell.expected_error,
+    }
+
+
 def crosscheck_csv(shown: CrosscheckView) -> str:
     """One line per cell."""
-    rows = [
-        (
-            c.link, c.step, _agents(c), c.runs, c.mean, c.error, c.expected, c.z, c.p,
-            "agrees" if c.agrees else "differs", c.quantity, c.metric, c.column, c.expected_error,
-        )
-        for c in shown.verdict.cells
-    ]  # fmt: skip
-    headings = (
-        "link", "step", "agents", "runs", "mean", "standard_error", "expected", "z", "p_corrected", "verdict",
-        "quantity", "metric", "column", "expected_standard_error",
-    )  # fmt: skip
-    return to_csv(headings, rows)
+    said = {True: "agrees", False: "differs"}
+    own = ({"link": c.link, "agents": _agents(c), "z": c.z, "verdict": said[c.agrees]} for c in shown.verdict.cells)
+    return records_csv(COLUMNS, (_record(c) | more for c, more in zip(shown.verdict.cells, own, strict=True)))
 
 
 def crosscheck_json(shown: CrosscheckView) -> dict[str, Any]:
-    """Return the object of schema stochfuse.crosscheck/1; a z-score that is infinite is null."""
-    v = shown.verdict
-    p = v.prediction
-    return {
-        "schema": SCHEMA,
-        "version": __version__,
-        "verdict": "agree" if v.agrees else "disagree",
-        "alpha": v.alpha,
-        "p_largest": v.p_largest,
-        "p_together": v.p_together,
-        "method": p.method,
-        "estimator": p.estimator,
-        "quantity": shown.quantity,
-        "metric": shown.senses[0][1] if shown.senses else v.metric.name,
-        "cells": [
-            {
-                "link": _value(c.link),
-                "step": c.step,
-                "agents": list(c.agents),
-                "runs": c.runs,
-                "mean": c.mean,
-                "standard_error": c.error,
-                "expected": c.expected,
-                "z": c.z if np.isfinite(c.z) else None,
-                "p_corrected": c.p,
-                "agrees": c.agrees,
-                "quantity": c.quantity,
-                "metric": c.metric,
-                "column": c.column,
-                "expected_standard_error": c.expected_error,
-            }
-            for c in v.cells
-        ],
-        "consistency": dict(v.consistency),
-        "evidence": list(v.evidence),
-        "causes": [cause._asdict() for cause in v.causes],
-        "scenario": p.scenario.to_mapping(),
-        "meta": {"description": list(shown.titles), "nature": p.nature, "notes": [*p.notes, *v.notes]},
-    }
+    """Return the object of schema stochfuse.crosscheck/1."""
+    v, p = shown.verdict, shown.verdict.prediction
+    return stamped(
+        SCHEMA,
+        verdict="agree" if v.agrees else "disagree",
+        alpha=v.alpha,
+        p_largest=v.p_largest,
+        p_together=v.p_together,
+        method=p.method,
+        estimator=p.estimator,
+        quantity=shown.quantity,
+        metric=shown.senses[0][1] if shown.senses else v.metric.name,
+        cells=list(map(_record, v.cells)),
+        consistency=dict(v.consistency),
+        evidence=list(v.evidence),
+        causes=[cause._asdict() for cause in v.causes],
+        scenario=p.scenario.to_mapping(),
+        meta={"description": list(shown.titles), "nature": p.nature, "notes": [*p.notes, *v.notes]},
+    )
 
 
 def _value(link: str) -> float | str:
@@ -218,8 +213,6 @@ def _value(link: str) -> float | str:
 
 def draw(shown: CrosscheckView) -> Any:
     """Return the figure."""
-    from matplotlib.lines import Line2D
-
     cells = shown.verdict.cells
     panels: dict[tuple[str, str, str], list[Cell]] = {}
     for cell in cells:
@@ -232,18 +225,12 @@ def draw(shown: CrosscheckView) -> Any:
         for i, (link, color) in enumerate(zip(chosen, shades(len(chosen)), strict=True))
     }
     across, down = min(ACROSS, len(kept) or 1), -(-len(kept) // ACROSS)
-    figure = figure_class()(figsize=(max(7.5, 1.2 + 3.6 * across), 4.4 + 2.7 * down), layout="constrained")
+    figure = canvas(max(7.5, 1.2 + 3.6 * across), 4.4 + 2.7 * down)
     grid = figure.add_gridspec(1 + down, across, height_ratios=[1.15] + [1.0] * down)
     said = _draw_scores(figure.add_subplot(grid[0, :]), shown, looks)
     for place, key in enumerate(kept):
         _draw_panel(figure.add_subplot(grid[1 + place // across, place % across]), shown, key, panels[key], looks)
-    below(
-        figure,
-        [
-            Line2D([], [], markersize=4, label=f"µ = {link}" if link else "simulator", **look)
-            for link, look in looks.items()
-        ],
-    )
+    below(figure, [entry(f"µ = {link}" if link else "simulator", markersize=4, **look) for link, look in looks.items()])
     left = [f"{len(kept)} of {len(panels)} panels, those with the largest |z|"] if len(kept) < len(panels) else []
     left += [f"{len(chosen)} of {len(links)} link probabilities"] if len(chosen) < len(links) else []
     lines = ["points: simulator, ± two standard errors; lines: expected", *said, *left]
@@ -266,7 +253,6 @@ def _beside(cells: Sequence[Cell], place: int, places: int) -> np.ndarray:
 
 def _draw_scores(axes: Any, shown: CrosscheckView, looks: dict[str, dict[str, Any]]) -> list[str]:
     """Draw z-scores, and return what is to be said of them."""
-    from matplotlib.ticker import MaxNLocator
     from scipy.special import ndtri
 
     v = shown.verdict
@@ -289,9 +275,7 @@ def _draw_scores(axes: Any, shown: CrosscheckView, looks: dict[str, dict[str, An
     for sign in (1, -1):
         axes.axhline(sign * limit, color="0.2", linewidth=0.8, linestyle="--")
     axes.set_ylim(-reach, reach)
-    axes.set_ylabel("z, in standard errors", fontsize="small")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.grid(alpha=0.3)
+    labelled(axes, None, "z, in standard errors", whole=True)
     said = [f"dashed: |z| = {limit:.2f}, reached by one of {counted(len(v.cells), 'cell')} with probability {level:g}"]
     return [*said, "triangles: beyond the axis"] if beyond else said
 
@@ -299,8 +283,6 @@ def _draw_scores(axes: Any, shown: CrosscheckView, looks: dict[str, dict[str, An
 def _draw_panel(
     axes: Any, shown: CrosscheckView, key: tuple[str, str, str], cells: Sequence[Cell], looks: dict[str, dict[str, Any]]
 ) -> None:
-    from matplotlib.ticker import MaxNLocator
-
     quantity, name, agents = key
     for place, (link, look) in enumerate(looks.items()):
         mine = sorted((cell for cell in cells if cell.link == link), key=lambda cell: cell.step)
@@ -315,8 +297,7 @@ def _draw_panel(
     who = f"agent {agents}" if agents.isdigit() else f"agents {agents}"
     heading = "NEES" if quantity == "nees" else f"{quantity}, {name}"
     axes.set_title(f"{heading}; {who}", fontsize="small")
-    axes.set_ylabel("NEES" if quantity == "nees" else shown.view(quantity, name).axis, fontsize="small")
-    axes.set_xlabel("step k", fontsize="small")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    labelled(axes, "step k", "NEES" if quantity == "nees" else shown.view(quantity, name).axis, whole=True)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.label.set_size("small")
     axes.tick_params(labelsize="small")
-    axes.grid(alpha=0.3)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import sympy
 
-from stochfuse import __version__
+from stochfuse.report.table import stamped
 from stochfuse.scenario.registry import CLAIMED, GENERAL, LFG, NAIVE, OPTIMAL, RMS, SIMPLIFIED
 from stochfuse.symbolic.general import GeneralForm
 from stochfuse.symbolic.simplified import FIXED, MOST_AGENTS_CLEARED, MU, SimplifiedForm
@@ -52,9 +52,9 @@ def derivation(form: SimplifiedForm | GeneralForm) -> Derivation:
         "symbols": ["mu", *map(str, form.symbols)],
     }
     if isinstance(form, GeneralForm):
-        return Derivation(_general_title(form), _general_formulas(form), facts, _latex_names(form.step))
+        return Derivation(_title(form), _general_formulas(form), facts, _latex_names(form.step))
     priors = {str(name): _latex_prior(str(name)) for name, _ in form.chain if str(name).endswith("_prior")}
-    return Derivation(_simplified_title(form), _simplified_formulas(form), facts, _latex_names(form.step) | priors)
+    return Derivation(_title(form), _simplified_formulas(form), facts, _latex_names(form.step) | priors)
 
 
 def _agents(n: int) -> str:
@@ -65,28 +65,24 @@ _METHODS = {LFG: GENERAL, NAIVE: NAIVE, OPTIMAL: OPTIMAL}
 _SYMBOLS = "mu: link probability, q, r: process and measurement noise variance, p0: variance of the initial estimates"
 
 
-def _simplified_title(form: SimplifiedForm) -> str:
+def _title(form: SimplifiedForm | GeneralForm) -> str:
+    if isinstance(form, SimplifiedForm):
+        what, exact = "Simplified formulation (54)", "approximate: mean field"
+        quantity, agents = "claimed posterior covariance P_k", _agents(form.agents)
+    else:
+        rule = "naive fusion (42)/(43)" if form.estimator == NAIVE else "the Local Fusion Graph"
+        what, exact = f"General formulation (49) of {rule}", "exact: every outcome"
+        quantity = f"{form.quantity} posterior covariance P_k"
+        agents = f"{_agents(form.agents)}, {form.architecture}"
+        if form.estimator == OPTIMAL:
+            what, exact = "Contact chain", "exact: every path; the best that linear fusion can do"
+            quantity = f"{OPTIMAL} posterior covariance P_k"
+        elif form.quantity == RMS:
+            quantity = "squared posterior error M_k (noise, and the bias from the initial error b)"
     start = "shared" if form.shared else "independent"
     return (
-        f"Simplified formulation (54), {_agents(form.agents)}, scalar state with F = G = H = 1, {start} "
-        f"initial estimates: "
-        f"expected claimed posterior covariance P_k after step k (approximate: mean field). {_SYMBOLS}"
-    )
-
-
-def _general_title(form: GeneralForm) -> str:
-    start = "shared" if form.shared else "independent"
-    rule = "naive fusion (42)/(43)" if form.estimator == NAIVE else "the Local Fusion Graph"
-    what, exact = f"General formulation (49) of {rule}", "every outcome"
-    quantity = f"{form.quantity} posterior covariance P_k"
-    if form.estimator == OPTIMAL:
-        what, exact = "Contact chain", "every path; the best that linear fusion can do"
-        quantity = f"{OPTIMAL} posterior covariance P_k"
-    elif form.quantity == RMS:
-        quantity = "squared posterior error M_k (noise, and the bias from the initial error b)"
-    return (
-        f"{what}, {_agents(form.agents)}, {form.architecture}, scalar state with F = G = H = 1, {start} initial "
-        f"estimates: expected {quantity} after step k (exact: {exact}). {_SYMBOLS}"
+        f"{what}, {agents}, scalar state with F = G = H = 1, {start} initial estimates: expected {quantity} "
+        f"after step k ({exact}). {_SYMBOLS}"
     )
 
 
@@ -171,15 +167,10 @@ def to_latex(made: Derivation) -> str:
 
 def to_mapping(made: Derivation) -> dict[str, Any]:
     """Return an object of texts that SymPy can read back."""
-    return {
-        "schema": SCHEMA,
-        "version": __version__,
-        **made.facts,
-        "description": made.title,
-        "formulas": [
-            {"key": f.key, "says": f.says, "name": str(f.name), "expression": str(f.expression)} for f in made.formulas
-        ],
-    }
+    formulas = [
+        {"key": f.key, "says": f.says, "name": str(f.name), "expression": str(f.expression)} for f in made.formulas
+    ]
+    return stamped(SCHEMA, **made.facts, description=made.title, formulas=formulas)
 
 
 def _latex_names(step: int) -> dict[str, str]:

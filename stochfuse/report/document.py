@@ -173,7 +173,9 @@ def _again(told: DocumentNote) -> str:
 
 
 def _scenario(mapping: Mapping[str, Any]) -> str:
-    text = to_toml(mapping)
+    text = to_toml(mapping) if mapping else ""
+    if not text:
+        return ""
     if len(text) > MOST_SCENARIO:
         return f"<p>The scenario is not shown: it has {len(text):,} letters.</p>"
     return f"<pre>{escape(text)}</pre>"

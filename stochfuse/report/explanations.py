@@ -2,100 +2,74 @@
 
 from __future__ import annotations
 
+import re
 from textwrap import fill
 from typing import NamedTuple
 
 from stochfuse.errors import UsageError, nearest
-from stochfuse.report.table import Report, Table, to_csv
+from stochfuse.report.table import Report
 from stochfuse.scenario import capabilities, registry
 
 SCHEMA = "stochfuse.explanation/1"
-TERMS = {
-    "prior": "The estimate before the measurement of a step: predicted from the step before, k|k-1.",
-    "posterior": (
-        "The estimate after a step's measurement and fusion. Every table shows posteriors unless it says prior."
-    ),
-    "link probability": (
-        "µ: the probability that one message from one agent reaches another within a step. Without "
-        "bursts, messages are lost independently of each other and of the data."
-    ),
-    "critical link probability": (
-        "The µ above which the averaged covariance stays bounded where a mode of the model grows by itself: 1 - "
-        "1/|eigenvalue|^2 where one message shows the state, more where it shows a part (Sinopoli et al. 2004). See "
-        "stochfuse solve --critical."
-    ),
-    "steady state": (
-        "What an expectation tends to as the steps go on; where sensors have periods a cycle, of which the mean is "
-        "shown. A fixed point of (54); of the optimum enclosed; anything else sampled after a burn-in, by which two "
-        "samples of the same arrivals, from starts far apart, no longer differ. See stochfuse predict --steady."
-    ),
-    "exact": (
-        "An average over every outcome of which messages arrive, each with its probability; only rounding "
-        "is left, and its reach is checked."
-    ),
-    "approximate": (
-        "The mean field: after every step the average covariance stands for all outcomes, and the next "
-        "step goes on from it. Fast for any number of agents; within a few per cent of the exact average "
-        "where agents and links are alike, and tens of per cent off where they are not."
-    ),
-    "bound": "The value is proved to lie within the relative distance that a note gives.",
-    "sampled": (
-        "A mean over drawn outcomes; ± is one standard error, the next sample's mean lies within two of "
-        "them in 95 % of all cases."
-    ),
-    "control variate": (
-        "What is drawn along with a sampled value and has a known mean: by what its own sample is off, the value is "
-        "corrected. Here the exact optimum of every outcome, and of that itself a filter of the numbers heard; see "
-        "--control and --precision."
-    ),
-    "pedigree": (
-        "Of an estimate: the set of measurements and first estimates that went into it. What two "
-        "pedigrees have in common must be counted once."
-    ),
-    "innovation": "What a measurement says beyond the prediction, z - H x; its covariance is H P H' + R.",
-    "NEES": (
-        "Normalised estimation error squared, e' P^-1 e. Its mean is the state's dimension where the "
-        "claim is true; more where it is overconfident."
-    ),
-    "NIS": "Normalised innovation squared, the same of the innovation; needs no truth.",
-    "realised": (
-        "What an estimator's error came to on data, x̂ less the truth: a sample, to be laid beside what is predicted, "
-        "over noises and arrivals, or given these very arrivals. See stochfuse run and simulate."
-    ),
-    "replay": (
-        "One record of what arrived and what was measured, followed step by step by the same estimators that other "
-        "engines average."
-    ),
-    "mean field": "See approximate.",
-    "ad-hoc": "Every message reaches each agent that could hear it, or not, independently of the others.",
-    "broadcast": "A message reaches everyone, or no one.",
-    "cyclic": "Agents in a ring: each hears the next one only.",
-    "nominal path": (
-        "Where a target is meant to be at each step, key model.nominal. Sensors by name (range, bearing, …) "
-        "are linearised about it, and see or do not see the target there."
-    ),
-    "burst": (
-        "A link that remembers: good and bad states with a transition probability each (Gilbert, "
-        "Elliott), key network.burst."
-    ),
-    "delay": (
-        "Messages that arrive late, with given probabilities of 0, 1, … steps, key network.delay; they "
-        "are brought forward to the step in which they arrive."
-    ),
-    "consistency": (
-        "Actual divided by claimed: 1 where an estimator knows how good it is, more where it is "
-        "overconfident, less where it is cautious."
-    ),
-    "claimed": (
-        "What a filter believes of itself. It is true only if what it believes of its inputs is: a rule "
-        "that counts shared information twice claims too little."
-    ),
-    "actual": ("The covariance that an estimate's error truly has, worked out from what every noise came to in it."),
-    "optimal": (
-        "One Kalman filter over all measurements whose messages reached an agent, directly or through "
-        "others: no linear rule can do better with what arrived."
-    ),
-}
+
+
+def _glossary(text: str) -> dict[str, str]:
+    """Return the paragraphs by their words; what continues one is indented."""
+    entries = (entry.partition(": ") for entry in re.split(r"\n(?! )", text.strip()))
+    return {word: " ".join(paragraph.split()) for word, _, paragraph in entries}
+
+
+TERMS = _glossary("""
+prior: The estimate before the measurement of a step: predicted from the step before, k|k-1.
+posterior: The estimate after a step's measurement and fusion. Every table shows posteriors unless it says prior.
+link probability: µ: the probability that one message from one agent reaches another within a step. Without bursts,
+  messages are lost independently of each other and of the data.
+critical link probability: The µ above which the averaged covariance stays bounded where a mode of the model grows by
+  itself: 1 - 1/|eigenvalue|^2 where one message shows the state, more where it shows a part (Sinopoli et al. 2004).
+  See stochfuse solve --critical.
+steady state: What an expectation tends to as the steps go on; where sensors have periods a cycle, of which the mean
+  is shown. A fixed point of (54); of the optimum enclosed; anything else sampled after a burn-in, by which two
+  samples of the same arrivals, from starts far apart, no longer differ. See stochfuse predict --steady.
+exact: An average over every outcome of which messages arrive, each with its probability; only rounding is left, and
+  its reach is checked.
+approximate: The mean field: after every step the average covariance stands for all outcomes, and the next step goes
+  on from it. Fast for any number of agents; within a few per cent of the exact average where agents and links are
+  alike, and tens of per cent off where they are not.
+bound: The value is proved to lie within the relative distance that a note gives.
+sampled: A mean over drawn outcomes; ± is one standard error, the next sample's mean lies within two of them in 95 %
+  of all cases.
+control variate: What is drawn along with a sampled value and has a known mean: by what its own sample is off, the
+  value is corrected. Here the exact optimum of every outcome, and of that itself a filter of the numbers heard; see
+  --control and --precision.
+pedigree: Of an estimate: the set of measurements and first estimates that went into it. What two pedigrees have in
+  common must be counted once.
+innovation: What a measurement says beyond the prediction, z - H x; its covariance is H P H' + R.
+NEES: Normalised estimation error squared, e' P^-1 e. Its mean is the state's dimension where the claim is true; more
+  where it is overconfident.
+NIS: Normalised innovation squared, the same of the innovation; needs no truth.
+realised: What an estimator's error came to on data, x̂ less the truth: a sample, to be laid beside what is predicted,
+  over noises and arrivals, or given these very arrivals. See stochfuse run and simulate.
+replay: One record of what arrived and what was measured, followed step by step by the same estimators that other
+  engines average.
+mean field: See approximate.
+ad-hoc: Every message reaches each agent that could hear it, or not, independently of the others.
+broadcast: A message reaches everyone, or no one.
+cyclic: Agents in a ring: each hears the next one only.
+nominal path: Where a target is meant to be at each step, key model.nominal. Sensors by name (range, bearing, …) are
+  linearised about it, and see or do not see the target there.
+burst: A link that remembers: good and bad states with a transition probability each (Gilbert, Elliott), key
+  network.burst.
+delay: Messages that arrive late, with given probabilities of 0, 1, … steps, key network.delay; they are brought
+  forward to the step in which they arrive.
+consistency: Actual divided by claimed: 1 where an estimator knows how good it is, more where it is overconfident,
+  less where it is cautious.
+claimed: What a filter believes of itself. It is true only if what it believes of its inputs is: a rule that counts
+  shared information twice claims too little.
+actual: The covariance that an estimate's error truly has, worked out from what every noise came to in it.
+optimal: One Kalman filter over all measurements whose messages reached an agent, directly or through others: no
+  linear rule can do better with what arrived.
+""")
+"""Words and their paragraphs, in the order of the handbook."""
 
 
 class Entry(NamedTuple):
@@ -109,30 +83,27 @@ class Entry(NamedTuple):
 def explanations() -> dict[str, Entry]:
     """Return every word that can be explained."""
     found = [Entry(e.name, "estimator", _sentences(e.title, f"Source: {e.source}")) for e in registry.ESTIMATOR]
-    found += [
-        Entry(e.name, "method", _sentences(f"{e.title}: {e.help}", f"Source: {e.source}", f"Nature: {e.nature}"))
-        for e in registry.ENGINE
-    ]
-    shorts = [
-        Entry(s.name, "method", f"Short for --estimator {s.estimator} --method {s.engine}.") for s in registry.SHORT
-    ]
-    found += [Entry(q.name, "quantity", _sentences(q.help)) for q in registry.QUANTITY]
-    found += [Entry(m.name.partition(":")[0], "metric", _sentences(m.help)) for m in registry.METRIC]
-    found += [Entry(s.name.partition(":")[0], "statistic", _sentences(s.help)) for s in registry.STATISTIC]
-    found += [
-        Entry(
-            f.name,
-            "feature of a scenario",
-            _sentences(f"in a scenario file: {f.key}", "stochfuse methods --matrix shows what takes it"),
-        )
-        for f in capabilities.FEATURES
-    ]
+    for e in registry.ENGINE:
+        text = _sentences(f"{e.title}: {e.help}", f"Source: {e.source}", f"Nature: {e.nature}")
+        found.append(Entry(e.name, "method", text))
+    for kind, entries in (
+        ("quantity", registry.QUANTITY),
+        ("metric", registry.METRIC),
+        ("statistic", registry.STATISTIC),
+    ):
+        found += [Entry(one.name.partition(":")[0], kind, _sentences(one.help)) for one in entries]
+    for f in capabilities.FEATURES:
+        text = _sentences(f"in a scenario file: {f.key}", "stochfuse methods --matrix shows what takes it")
+        found.append(Entry(f.name, "feature of a scenario", text))
+    for s in registry.SHORT:
+        found.append(Entry(s.name, "method", f"Short for --estimator {s.estimator} --method {s.engine}."))
+    found += [Entry(word, "term", text) for word, text in TERMS.items()]
     known: dict[str, Entry] = {}
-    for one in (*found, *shorts, *(Entry(word, "term", text) for word, text in TERMS.items())):
+    for one in found:
         before = known.get(one.word)
-        known[one.word] = (
-            one if before is None else Entry(one.word, f"{before.kind}, {one.kind}", f"{before.text} {one.text}")
-        )
+        if before is not None:
+            one = Entry(one.word, f"{before.kind}, {one.kind}", f"{before.text} {one.text}")
+        known[one.word] = one
     return known
 
 
@@ -145,25 +116,13 @@ def explained(word: str | None, width: int) -> tuple[str, Report]:
         If the word is not known; names the nearest.
     """
     known = explanations()
-    if word is None:
-        chosen = list(known.values())
-    else:
-        key = next((k for k in known if k.lower() == word.strip().lower()), None)
-        if key is None:
-            raise UsageError(
-                f"explain: expected a word that outputs use, got '{word}'{nearest(word, known)}; without one: all"
-            )
-        chosen = [known[key]]
-    text = (
-        "\n".join(fill(f"{one.word} ({one.kind}): {one.text}", width, subsequent_indent="  ") for one in chosen) + "\n"
-    )
-    keys = Entry._fields
-    report = Report(
-        lambda: Table(("What the words mean",), keys, (), tuple(tuple(one) for one in chosen)),
-        lambda: to_csv(keys, chosen),
-        lambda: {"schema": SCHEMA, "explanations": [one._asdict() for one in chosen]},
-    )
-    return text, report
+    chosen = [one for key, one in known.items() if word is None or key.lower() == word.strip().lower()]
+    if not chosen:
+        near = nearest(word or "", known)
+        raise UsageError(f"explain: expected a word that outputs use, got '{word}'{near}; without one: all")
+    text = "".join(fill(f"{one.word} ({one.kind}): {one.text}", width, subsequent_indent="  ") + "\n" for one in chosen)
+    facts = {"schema": SCHEMA, "explanations": [one._asdict() for one in chosen]}
+    return text, Report.of_rows(("What the words mean",), Entry._fields, chosen, facts)
 
 
 def _sentences(*texts: str) -> str:

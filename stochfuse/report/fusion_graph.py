@@ -9,11 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse import __version__
 from stochfuse.estimators.fusion_graph import Explanation, FusionGraph, Node, Term
 from stochfuse.kalman.metrics import Metric
-from stochfuse.report.plot import figure_class
-from stochfuse.report.table import number
+from stochfuse.report.plot import canvas, entry
+from stochfuse.report.table import number, stamped
 
 SCHEMA = "stochfuse.fusion-graph/1"
 REMOVED, OWN, OTHER = "#f4b183", "#9dc3e6", "#ffffff"
@@ -76,15 +75,14 @@ def _lines(terms: tuple[Term, ...], indent: int) -> list[str]:
 
 def to_mapping(graph: FusionGraph, explanations: list[Explanation], claimed: ClaimedAtNodes | None) -> dict[str, Any]:
     """Return an object with nodes, edges and what explains every fusion."""
-    return {
-        "schema": SCHEMA,
-        "version": __version__,
+    return stamped(
+        SCHEMA,
         **({} if claimed is None else {"metric": claimed.metric.name}),
-        "agents": graph.history.agents,
-        "steps": graph.history.steps,
-        "nodes": [list(node) for node in graph.nodes],
-        "edges": [[list(parent), list(node)] for node in graph.nodes for parent in graph.parents(node)],
-        "fusions": [
+        agents=graph.history.agents,
+        steps=graph.history.steps,
+        nodes=[list(node) for node in graph.nodes],
+        edges=[[list(parent), list(node)] for node in graph.nodes for parent in graph.parents(node)],
+        fusions=[
             {
                 "agent": e.agent,
                 "step": e.step,
@@ -95,7 +93,7 @@ def to_mapping(graph: FusionGraph, explanations: list[Explanation], claimed: Cla
             }
             for e in explanations
         ],
-    }
+    )
 
 
 def _term(term: Term) -> dict[str, Any]:
@@ -155,13 +153,11 @@ def _id(node: Node) -> str:
 
 def draw(graph: FusionGraph, explanation: Explanation):
     """Return a figure of one agent's graph at a step: agents as rows, steps as columns, as in the thesis' figure 5."""
-    Figure = figure_class()
-    from matplotlib.lines import Line2D
+    figure = canvas(max(5.0, 1.9 * explanation.step + 2.2), max(3.2, 1.05 * graph.history.agents + 1.6))
     from matplotlib.patches import Patch
 
     shown, removed = _roles(graph, explanation)
     agent, step, n = explanation.agent, explanation.step, graph.history.agents
-    figure = Figure(figsize=(max(5.0, 1.9 * step + 2.2), max(3.2, 1.05 * n + 1.6)), layout="constrained")
     axes = figure.add_subplot()
     radius = 0.17
 
@@ -172,12 +168,8 @@ def draw(graph: FusionGraph, explanation: Explanation):
     for parent, child, late in _edges(graph, shown, agent, step):
         a, b = place(parent), place(child)
         way = (b - a) / np.hypot(*(b - a))
-        axes.annotate(
-            "",
-            b - radius * way,
-            a + radius * way,
-            arrowprops={"arrowstyle": "->", "linestyle": "--" if late else "-", "color": "0.35", "lw": 1.1},
-        )
+        arrow = {"arrowstyle": "->", "linestyle": "--" if late else "-", "color": "0.35", "lw": 1.1}
+        axes.annotate("", b - radius * way, a + radius * way, arrowprops=arrow)
     for node in sorted(shown):
         x, y = place(node)
         color = REMOVED if node in removed else OTHER
@@ -195,7 +187,7 @@ def draw(graph: FusionGraph, explanation: Explanation):
     key = [
         Patch(facecolor=OWN, edgecolor="black", label="fused estimate"),
         Patch(facecolor=REMOVED, edgecolor="black", label="removed as common"),
-        Line2D([], [], color="0.35", linestyle="--", label="late message"),
+        entry("late message", color="0.35", linestyle="--"),
     ]
     figure.legend(handles=key, loc="outside lower center", ncols=3, fontsize="small", frameon=False)
     return figure

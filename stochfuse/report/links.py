@@ -14,10 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse import __version__
-from stochfuse.report.network_figure import draw_network
-from stochfuse.report.plot import figure_class, titled
-from stochfuse.report.table import Report, Table, to_csv
+from stochfuse.report.network_figure import draw_circle, draw_network
+from stochfuse.report.plot import canvas, titled
+from stochfuse.report.table import Report, Table, listed, stamped, to_csv
 from stochfuse.scenario.links import MEMORY, Links
 from stochfuse.scenario.radio import distances
 
@@ -107,9 +106,8 @@ def links_table(found: Links) -> list[Table]:
         f"Link probabilities of {found.source} ({found.kind}): {len(names)} nodes",
         "rows receive, columns send; ? is unknown, never 0",
     )
-    pairs = [(i, j) for i in range(len(names)) for j in range(len(names)) if i != j and not np.isnan(found.link[i, j])]
     rows = []
-    for i, j in pairs:
+    for i, j in np.argwhere(~np.isnan(found.link) & ~np.eye(len(names), dtype=bool)).tolist():
         sent = "" if found.sent is None else f"{found.received[i, j]} of {found.sent[i, j]}"  # type: ignore[index]
         span = "" if np.isnan(found.low[i, j]) else f"{found.low[i, j]:.3f} to {found.high[i, j]:.3f}"
         back = "?" if np.isnan(found.link[j, i]) else f"{found.link[i, j] - found.link[j, i]:+.2f}"
@@ -175,30 +173,24 @@ def links_json(found: Links) -> dict[str, Any]:
     n = len(found.nodes)
     burst = found.burst and [[found.burst.get((i, j)) for j in range(n)] for i in range(n)]
     counted = found.sent is not None
-    return {
-        "schema": SCHEMA,
-        "version": __version__,
-        "source": found.source,
-        "kind": found.kind,
-        "nodes": list(found.nodes),
-        "link": _listed(found.link),
-        "low": _listed(found.low) if counted else None,
-        "high": _listed(found.high) if counted else None,
-        "sent": found.sent.tolist() if found.sent is not None else None,
-        "received": found.received.tolist() if found.received is not None else None,
-        "burst": burst or None,
-        "memory": None if found.memory is None else _listed(found.memory),
-        "delay": None if found.delay is None else list(found.delay),
-        "notes": list(found.notes),
-        "steps": list(range(1, len(found.link) + 1)) if found.varies else None,
-        "positions": [place.tolist() for place in found.places] or None,
-        "cases": [{"name": name, "link": _listed(link)} for name, link in found.cases] or None,
-    }
-
-
-def _listed(M: np.ndarray) -> list[Any]:
-    """Nested lists, null for what is unknown."""
-    return [None if np.isnan(x) else float(x) for x in M] if M.ndim == 1 else [_listed(row) for row in M]
+    return stamped(
+        SCHEMA,
+        source=found.source,
+        kind=found.kind,
+        nodes=list(found.nodes),
+        link=listed(found.link),
+        low=listed(found.low) if counted else None,
+        high=listed(found.high) if counted else None,
+        sent=found.sent.tolist() if found.sent is not None else None,
+        received=found.received.tolist() if found.received is not None else None,
+        burst=burst or None,
+        memory=None if found.memory is None else listed(found.memory),
+        delay=None if found.delay is None else list(found.delay),
+        notes=list(found.notes),
+        steps=list(range(1, len(found.link) + 1)) if found.varies else None,
+        positions=[place.tolist() for place in found.places] or None,
+        cases=[{"name": name, "link": listed(link)} for name, link in found.cases] or None,
+    )
 
 
 def network_table(found: Links) -> str:
@@ -240,7 +232,7 @@ def _rows(link: np.ndarray, *, exact: bool, indent: str = "") -> str:
 def draw(found: Links) -> Any:
     """Return the figure: µ̂ as a heat map, and the nodes on a circle with what each hears."""
     n = len(found.nodes)
-    figure = figure_class()(figsize=(12.5, 6.2), layout="constrained")
+    figure = canvas(12.5, 6.2)
     left, right = figure.subplots(1, 2)
     image = left.imshow(np.ma.masked_invalid(found.link), vmin=0, vmax=1, cmap="viridis")
     left.set_facecolor("0.9")
@@ -253,29 +245,9 @@ def draw(found: Links) -> Any:
             µ = found.link[i, j]
             left.text(j, i, f"{µ:.2f}", ha="center", va="center", fontsize="x-small", color="w" if µ < 0.6 else "k")
     figure.colorbar(image, ax=left, label="link probability µ (grey: unknown)", shrink=0.8)
-    angle = 2 * np.pi * np.arange(n) / n
-    x, y = np.sin(angle), np.cos(angle)
-    for i, j in zip(*np.nonzero(np.nan_to_num(found.link) > 0), strict=True):
-        right.annotate(
-            "",
-            (x[i] * 0.93, y[i] * 0.93),
-            (x[j] * 0.93, y[j] * 0.93),
-            arrowprops={
-                "arrowstyle": "-|>",
-                "linewidth": 0.3 + 2.0 * found.link[i, j],
-                "color": str(round(0.85 - 0.85 * float(found.link[i, j]), 3)),
-                "connectionstyle": "arc3,rad=0.08",
-                "shrinkA": 0,
-                "shrinkB": 0,
-            },
-        )
-    for node, a, b in zip(found.nodes, x, y, strict=True):
-        right.text(1.12 * a, 1.12 * b, node, ha="center", va="center", fontsize="small")
-    right.set_xlim(-1.35, 1.35)
-    right.set_ylim(-1.35, 1.35)
-    right.set_aspect("equal")
-    right.set_axis_off()
-    titled(
-        figure, f"Link probabilities of {found.source} ({found.kind})", "right: the darker and thicker, the likelier"
-    )
+    name = draw_circle(right, found)
+    about = "right: the darker and thicker, the likelier"
+    titled(figure, f"Link probabilities of {found.source} ({found.kind})", about)
+    figure.draw_without_rendering()
+    name()
     return figure

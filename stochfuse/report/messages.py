@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse import __version__
 from stochfuse.kalman.metrics import Metric
 from stochfuse.questions.messages import IDENTITY_BYTES, NUMBER_BYTES, Accuracy, Bytes, Load, in_bytes
-from stochfuse.report.plot import COLORS, MARKERS, below, figure_class, spread, titled
-from stochfuse.report.predictions import PredictionView
+from stochfuse.report.plot import COLORS, MARKERS, MOST_MARKED, band, below, canvas, labelled, shades, spread, titled
+from stochfuse.report.predictions import WIDTH_95, PredictionView
 from stochfuse.report.rows import ResultRows
-from stochfuse.report.table import Report, Table, number, to_csv
+from stochfuse.report.table import Report, Table, number, records_csv, stamped
 from stochfuse.scenario.registry import LFG, NAIVE
 
 SCHEMA = "stochfuse.messages/1"
@@ -25,19 +24,7 @@ RULE_TITLES = {
     NAIVE: "naive fusion, the sender's latest node",
 }
 KINDS = ("moments", "distribution", "cdf", "accuracy")
-MOST_INSIDE = 6
-"""Curves up to which the legend stands inside the axes."""
-_SIZES = ("nodes", "probability", "cumulative")
-HEADINGS = {
-    "moments": ("mean", "std", "max", "standard_error", "mean_bytes", "max_bytes"),
-    "distribution": _SIZES,
-    "cdf": _SIZES,
-    "accuracy": (
-        "mean", "mean_bytes", "metric", "unit", "quantity", "method", "accuracy_nature", "accuracy",
-        "accuracy_standard_error_at_most",
-    ),
-}  # fmt: skip
-"""What CSV has beside the columns that every kind has."""
+RULE_DASHES = ("-", "--")
 
 
 @dataclass(frozen=True)
@@ -83,22 +70,12 @@ class LoadView:
     @property
     def whom(self) -> str:
         """One line: the scenario, whose load and which steps."""
-        scenario, one = self.loads[0].scenario, self.loads[0].alike
-        numbers = [s.network.agents for s in (self.rows.over.scenarios if self.rows.over else (scenario,))]
-        n = max(numbers)
-        whose = (
-            "alone"
-            if n == 1
-            else "every agent alike"
-            if one
-            else "an agent picked at random"
-            if self.agent == "mean"
-            else ""
-        )
-        whose = whose or f"agent {self.agent}"
-        span = f"{min(numbers)} to " * (len(set(numbers)) > 1) + str(n)
-        agents = f"{span} agent{'s' * (n > 1)}, {scenario.network.architecture}"
-        return f"{scenario.name}: {agents}; {whose}; {self.window}{self.rows.common}"
+        whose = "an agent picked at random" if self.agent == "mean" else f"agent {self.agent}"
+        if self.rows.sizes == [1]:
+            whose = "alone"
+        elif self.loads[0].alike:
+            whose = "every agent alike"
+        return f"{self.rows.agents}; {whose}; {self.window}{self.rows.common}"
 
     @property
     def what(self) -> str:
@@ -200,49 +177,50 @@ def _distribution_table(view: LoadView) -> Table:
 
 def load_csv(view: LoadView) -> str:
     """One line per rule and link probability, for distributions per size too."""
-    headings = ["rule", "nature", "agent", *view.rows.headings, "from_step", "to_step"]
-    headings += HEADINGS[view.kind]
-    rows: list[tuple[Any, ...]] = []
+    records = []
     for r, load in enumerate(view.loads):
         first, last = map(int, load.steps[[0, -1]])
         for i in range(len(load.link)):
-            start = (load.rule, load.nature, view.agent, *view.rows.record(i), first, last)
+            names = dict(zip(view.rows.headings, view.rows.record(i), strict=True))
+            start = {"rule": load.rule, "nature": load.nature, "agent": view.agent, **names}
+            start |= {"from_step": first, "to_step": last}
             if view.kind == "moments":
-                rows.append((*start, *_moments_cells(view, load, i)))
+                records.append(start | _moments(view, load, i))
             elif view.kind == "accuracy":
-                rows.append((*start, *_accuracy_cells(view, view.accuracies[r], i)))
+                records.append(start | _accuracy(view, view.accuracies[r], i))
             else:
                 both = zip(load.distribution(view.agent)[i].tolist(), load.cdf(view.agent)[i].tolist(), strict=True)
-                rows += [(*start, size, *each) for size, each in enumerate(both)]
-    return to_csv(headings, rows)
+                records += [
+                    start | {"nodes": size, "probability": p, "cumulative": q} for size, (p, q) in enumerate(both)
+                ]
+    return records_csv(tuple(records[0]), records)
 
 
-def _moments_cells(view: LoadView, load: Load, row: int) -> tuple[Any, ...]:
+def _moments(view: LoadView, load: Load, row: int) -> dict[str, Any]:
     error, size = load.standard_error(view.agent), view.bytes_of(load)
-    return (
-        float(load.mean(view.agent)[row]),
-        float(load.std(view.agent)[row]),
-        int(load.maximum(view.agent)[row]),
-        "" if error is None else float(error[row]),
-        float(size.mean[row]),
-        int(size.maximum[row]),
-    )
+    return {
+        "mean": float(load.mean(view.agent)[row]),
+        "std": float(load.std(view.agent)[row]),
+        "max": int(load.maximum(view.agent)[row]),
+        "standard_error": None if error is None else float(error[row]),
+        "mean_bytes": float(size.mean[row]),
+        "max_bytes": int(size.maximum[row]),
+    }
 
 
-def _accuracy_cells(view: LoadView, accuracy: Accuracy, row: int) -> tuple[Any, ...]:
-    shown = view.accuracy_view(accuracy)
-    load, p = accuracy.load, accuracy.prediction
-    return (
-        float(load.mean(view.agent)[row]),
-        float(view.bytes_of(load).mean[row]),
-        shown.metric.name,
-        shown.unit,
-        p.quantity,
-        p.method,
-        p.nature,
-        float(accuracy.values[row]),
-        "" if accuracy.error is None else float(accuracy.error[row]),
-    )
+def _accuracy(view: LoadView, accuracy: Accuracy, row: int) -> dict[str, Any]:
+    shown, load, p = view.accuracy_view(accuracy), accuracy.load, accuracy.prediction
+    return {
+        "mean": float(load.mean(view.agent)[row]),
+        "mean_bytes": float(view.bytes_of(load).mean[row]),
+        "metric": shown.metric.name,
+        "unit": shown.unit,
+        "quantity": p.quantity,
+        "method": p.method,
+        "accuracy_nature": p.nature,
+        "accuracy": float(accuracy.values[row]),
+        "accuracy_standard_error_at_most": None if accuracy.error is None else float(accuracy.error[row]),
+    }
 
 
 def load_json(view: LoadView) -> dict[str, Any]:
@@ -275,26 +253,23 @@ def load_json(view: LoadView) -> dict[str, Any]:
             "values": accuracy.values.tolist(),
             **({} if accuracy.error is None else {"standard_error_at_most": accuracy.error.tolist()}),
         }
-    return {
-        "schema": SCHEMA,
-        "version": __version__,
+    return stamped(
+        SCHEMA,
         **view.rows.facts,
-        "steps": first.steps.tolist(),
-        "rules": rules,
-        "scenario": first.scenario.to_mapping(),
-        "meta": {"description": list(view.titles), "agent": view.agent, "header_bytes": view.header or 0},
-    }
+        steps=first.steps.tolist(),
+        rules=rules,
+        scenario=first.scenario.to_mapping(),
+        meta={"description": list(view.titles), "agent": view.agent, "header_bytes": view.header or 0},
+    )
 
 
-def draw(view: LoadView):
+def draw(view: LoadView) -> Any:
     """Return the figure."""
-    figure = figure_class()(figsize=(7.5, 5.0), layout="constrained")
+    figure = canvas(7.5, 5.0)
     axes = figure.add_subplot()
     {"moments": _draw_moments, "accuracy": _draw_accuracy}.get(view.kind, _draw_distribution)(view, axes)
-    axes.set_ylim(bottom=0)
-    axes.grid(alpha=0.3)
     below(figure)
-    titled(figure, view.what, *view.titles[1:])
+    titled(figure, *view.titles)
     return figure
 
 
@@ -303,31 +278,25 @@ def _draw_moments(view: LoadView, axes: Any) -> None:
         _draw_steps(view, axes)
         return
     curves = view.rows.curves(None)
-    chosen = spread(len(curves.names))
-    for load, style, marker in zip(view.loads, ("-", "--"), MARKERS, strict=False):
-        for c in chosen:
-            x, pick = curves.x[c], curves.picks[c]
-            mean, std = load.mean(view.agent)[pick], load.std(view.agent)[pick]
-            label = ", ".join(filter(None, (SHORT[load.rule], curves.names[c])))
-            few = {"marker": marker if len(x) <= 30 else None, "markersize": 4}
-            line = axes.plot(x, mean, linestyle=style if len(chosen) > 1 else "-", label=label, **few)
-            if len(chosen) == 1:
-                low, color = np.maximum(mean - std, 0), line[0].get_color()
-                axes.fill_between(x, low, mean + std, color=color, alpha=0.15, linewidth=0)
-    axes.set_xlabel(curves.label)
-    if curves.whole:
-        axes.xaxis.set_major_locator(_whole_numbers())
-    band = " (band: ± one standard deviation)" if len(chosen) == 1 else ""
-    axes.set_ylabel(f"mean nodes per step{band}")
+    shown = curves.shown()
+    alone = len(shown) == 1
+    for load, style, marker in zip(view.loads, RULE_DASHES, MARKERS, strict=False):
+        for curve in shown:
+            mean, std = load.mean(view.agent)[curve.pick], load.std(view.agent)[curve.pick]
+            label = ", ".join(filter(None, (SHORT[load.rule], curve.name)))
+            few = {"marker": marker if len(curve.x) <= MOST_MARKED else None, "markersize": 4}
+            (line,) = axes.plot(curve.x, mean, linestyle="-" if alone else style, label=label, **few)
+            if alone:
+                band(axes, curve.x, np.maximum(mean - std, 0), mean + std, line.get_color())
+    what = "mean nodes per step" + " (band: ± one standard deviation)" * alone
+    labelled(axes, curves.label, what, whole=curves.whole, zero=True)
 
 
 def _draw_steps(view: LoadView, axes: Any) -> None:
     for load, style, label, color, i in _curves(view):
         mean = load.by_step(view.agent)[i] @ load.sizes
         axes.plot(load.steps, mean, style, marker=".", color=color, label=label)
-    axes.set_xlabel("step k")
-    axes.set_ylabel("mean nodes per step")
-    axes.xaxis.set_major_locator(_whole_numbers())
+    labelled(axes, "step k", "mean nodes per step", whole=True, zero=True)
 
 
 def _draw_distribution(view: LoadView, axes: Any) -> None:
@@ -339,27 +308,17 @@ def _draw_distribution(view: LoadView, axes: Any) -> None:
             axes.plot(whole, style, color=color, label=label, drawstyle="steps-post")
         else:
             axes.plot(values, style, color=color, label=label, marker=".")
-    axes.set_xlabel("nodes per step")
-    axes.set_ylabel("probability of at most so many" if view.kind == "cdf" else "probability")
-    axes.xaxis.set_major_locator(_whole_numbers())
+    what = "probability of at most so many" if view.kind == "cdf" else "probability"
+    labelled(axes, "nodes per step", what, whole=True, zero=True)
 
 
 def _curves(view: LoadView) -> Iterator[tuple[Load, str, str, Any, int]]:
     """Load, line style, label, colour and row of every curve: a style per rule, a colour per row."""
-    from matplotlib import colormaps
-
     names = _names(view)
     chosen = spread(len(names))
-    colors = colormaps["viridis"](np.linspace(0, 0.9, len(chosen)))
-    for load, style in zip(view.loads, ("-", "--"), strict=False):
-        for i, color in zip(chosen, colors, strict=True):
+    for load, style in zip(view.loads, RULE_DASHES, strict=False):
+        for i, color in zip(chosen, shades(len(chosen)), strict=True):
             yield load, style, f"{SHORT[load.rule]}, {names[i]}", color, i
-
-
-def _whole_numbers() -> Any:
-    from matplotlib.ticker import MaxNLocator
-
-    return MaxNLocator(integer=True)
 
 
 def _draw_accuracy(view: LoadView, axes: Any) -> None:
@@ -369,17 +328,13 @@ def _draw_accuracy(view: LoadView, axes: Any) -> None:
     for r, accuracy in enumerate(view.accuracies):
         load = accuracy.load.mean(view.agent)
         for c, (order,) in enumerate(picks):
-            errors = None if accuracy.error is None else 1.96 * accuracy.error[order]
-            label = None if c else SHORT[accuracy.load.rule]
-            axes.errorbar(
-                load[order], accuracy.values[order], errors, marker=MARKERS[r], color=COLORS[r], capsize=2, label=label
-            )
+            errors = None if accuracy.error is None else WIDTH_95 * accuracy.error[order]
+            style = {"marker": MARKERS[r], "color": COLORS[r], "label": None if c else SHORT[accuracy.load.rule]}
+            axes.errorbar(load[order], accuracy.values[order], errors, capsize=2, **style)
         for i in spread(len(names)):
-            axes.annotate(
-                names[i], (load[i], accuracy.values[i]), xytext=(4, 4), textcoords="offset points", fontsize=7
-            )
+            at = {"xytext": (4, 4), "textcoords": "offset points", "fontsize": 7}
+            axes.annotate(names[i], (load[i], accuracy.values[i]), **at)
     shown = view.accuracy_view(view.accuracies[0])
     bars = "; bars: at least 95 % confidence" if view.accuracies[0].error is not None else ""
     marks = "link probability µ" if view.rows.over is None else "what is swept"
-    axes.set_xlabel(f"mean nodes per step (marks: {marks}{bars})")
-    axes.set_ylabel(shown.axis)
+    labelled(axes, f"mean nodes per step (marks: {marks}{bars})", shown.axis, zero=True)

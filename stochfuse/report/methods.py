@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-from stochfuse import __version__
-from stochfuse.report.table import Report, Table, to_csv
+from stochfuse.report.table import Report, Table, stamped, to_csv
 from stochfuse.scenario import capabilities, registry
 from stochfuse.scenario.own_rules import OwnRule
 
@@ -74,18 +73,18 @@ def methods_csv(*, matrix: bool = False, own: Sequence[OwnRule] = ()) -> str:
 
 def methods_json(own: Sequence[OwnRule] = ()) -> dict[str, Any]:
     """Return registry and table with the keys of the schema."""
-    return {
-        "schema": SCHEMA,
-        "version": __version__,
-        "estimators": [{"name": e.name, "title": e.title, "source": e.source} for e in _entries(own)],
-        "engines": [
-            {"name": e.name, "title": e.title, "source": e.source, "nature": e.nature, "help": e.help}
-            for e in registry.ENGINE
-        ],
-        "short_forms": [{"name": s.name, "estimator": s.estimator, "engine": s.engine} for s in registry.SHORT],
-        "quantities": [{"name": q.name, "help": q.help} for q in registry.QUANTITY],
-        "metrics": [{"name": m.name, "help": m.help} for m in registry.METRIC],
-        "statistics": [{"name": s.name, "help": s.help} for s in registry.STATISTIC],
-        "features": [{"name": f.name, "key": f.key} for f in capabilities.FEATURES],
-        "matrix": capabilities.matrix(own),
-    }
+
+    def told(entries: Sequence[Any], *names: str) -> list[dict[str, Any]]:
+        return [{name: getattr(entry, name) for name in names} for entry in entries]
+
+    return stamped(
+        SCHEMA,
+        estimators=told(_entries(own), "name", "title", "source"),
+        engines=told(registry.ENGINE, "name", "title", "source", "nature", "help"),
+        short_forms=told(registry.SHORT, "name", "estimator", "engine"),
+        quantities=told(registry.QUANTITY, "name", "help"),
+        metrics=told(registry.METRIC, "name", "help"),
+        statistics=told(registry.STATISTIC, "name", "help"),
+        features=told(capabilities.FEATURES, "name", "key"),
+        matrix=capabilities.matrix(own),
+    )

@@ -18,7 +18,7 @@ from stochfuse.data.run import RunResult
 from stochfuse.fusion.inertial import POSITION
 from stochfuse.fusion.trajectory import displaced, geodetic
 from stochfuse.kalman.kernel import at_step
-from stochfuse.report.plot import COLORS, DASHES, below, figure_class, titled
+from stochfuse.report.plot import band, below, canvas, labelled, look, titled
 from stochfuse.scenario.checker import Checker
 from stochfuse.scenario.navigation import read_navigation
 
@@ -43,7 +43,7 @@ def draw_navigation(found: RunResult, title: Sequence[str], averages: Callable[[
     agent = (found.scenario.agent or 1) - 1
     x = found.traces[0].truth[:, min(agent, found.traces[0].truth.shape[1] - 1), POSITION]
     computed = displaced(where, x)
-    figure = figure_class()(figsize=(13.2, 9.6), layout="constrained")
+    figure = canvas(13.2, 9.6)
     grid = figure.add_gridspec(3, 3, height_ratios=(3.0, 3.0, 2.2))
     axes = np.array([[figure.add_subplot(grid[row, column]) for column in range(3)] for row in range(2)])
     averages(figure.add_subplot(grid[2, :]), found, "NEES")
@@ -54,21 +54,18 @@ def draw_navigation(found: RunResult, title: Sequence[str], averages: Callable[[
         for place, (sender, z) in enumerate(_fixes(found, agent)):
             fix = _shown(displaced(computed, -z))
             above.plot(seconds, fix[:, k], ".x"[place % 2], color="0.35", markersize=4, label=f"measured by {sender}")
-        above.set_ylabel(name)
+        labelled(above, None, name)
         above.ticklabel_format(useOffset=False)
         for place, trace in enumerate(found.traces):
-            style = {"color": COLORS[place % len(COLORS)], "linestyle": DASHES[place % len(DASHES)], "linewidth": 1.3}
+            style = {**look(place), "linewidth": 1.3}
             estimate = trace.x[:, agent, POSITION]
             above.plot(seconds, _shown(displaced(computed, -estimate))[:, k], label=trace.estimator, **style)
             error, sigma = (x - estimate)[:, k], 2 * np.sqrt(trace.variance[:, agent, POSITION][:, k])
-            axes[1, k].fill_between(seconds, -sigma, sigma, color=style["color"], alpha=0.15, linewidth=0)
+            band(axes[1, k], seconds, -sigma, sigma, style["color"])
             axes[1, k].plot(seconds, error, **style)
             for edge in (-sigma, sigma):  # told apart without colour
                 axes[1, k].plot(seconds, edge, **{**style, "linewidth": 0.6})
-        axes[1, k].set_ylabel(f"error {AXES[k]} [m]")
-        axes[1, k].set_xlabel("time [s]")
-        for each in axes[:, k]:
-            each.grid(alpha=0.3)
+        labelled(axes[1, k], "time [s]", f"error {AXES[k]} [m]")
     below(figure, axes[0, 0].get_legend_handles_labels()[0])
     name = network.names[agent] if network.names else f"agent {agent + 1}"
     titled(figure, *title, f"{name} in the first run: position, and its error with ±2σ claimed (thin)")

@@ -7,12 +7,12 @@ they cover least of what is drawn.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.report.plot import below, figure_class, titled
+from stochfuse.report.plot import below, canvas, entry, titled
 from stochfuse.scenario.links import Links
 
 LEAST = 0.01
@@ -62,16 +62,10 @@ def draw_network(found: Links, steps: Sequence[int]) -> Any:
     panels = list(_panels(found, steps))[:MOST_PANELS]
     low, high = _limits(found)
     across, down, size = _layout(len(panels), high - low)
-    figure = figure_class()(figsize=size, layout="compressed")
+    figure = canvas(*size, layout="compressed")
     grid = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
-    for axes, panel in zip(grid.flat, panels, strict=False):
-        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-        axes.set_title(panel.title, fontsize="small")
     for axes in grid.flat[len(panels) :]:
         axes.set_visible(False)
-    for axes in grid.flat:
-        if not found.places:
-            axes.set_axis_off()
     if found.places:
         for axes in grid[-1]:
             axes.set_xlabel("x [m]", fontsize="small")
@@ -82,13 +76,18 @@ def draw_network(found: Links, steps: Sequence[int]) -> Any:
         f"Links of {found.source} ({found.kind}): {len(found.nodes)} agents, {found.architecture}",
         *_says(found),
     )
-    arcs = [_draw_panel(axes, panel, found) for axes, panel in zip(grid.flat, panels, strict=False)]
-    below(figure, _legend(found))
+    naming = [_draw_panel(axes, panel, found) for axes, panel in zip(grid.flat, panels, strict=False)]
+    below(figure, [entry(f"µ = {µ:g}", **_ink(µ)) for µ in (1.0, 0.75, 0.5, 0.25, 0.05)])
     # names are put where they cover least, which is known once everything else has its place
     figure.draw_without_rendering()
-    for axes, panel, drawn in zip(grid.flat, panels, arcs, strict=False):
-        _name(axes, panel, drawn, found)
+    for name in naming:
+        name()
     return figure
+
+
+def draw_circle(axes: Any, found: Links) -> Callable[[], None]:
+    """Draw links that do not vary on some axes, and return what names their nodes once the figure is laid out."""
+    return _draw_panel(axes, next(_panels(found, (1,))), found)
 
 
 def _panels(found: Links, steps: Sequence[int]) -> Iterator[_NetworkPanel]:
@@ -105,8 +104,20 @@ def _places(found: Links, step: int) -> np.ndarray:
     """Where the agents are at a step, (n, 2)."""
     if found.places:
         return np.array([place[step - 1, :2] if place.ndim == 2 else place[:2] for place in found.places])
-    angle = 2 * np.pi * np.arange(len(found.nodes)) / len(found.nodes)
+    return circle(len(found.nodes))
+
+
+def circle(n: int) -> np.ndarray:
+    """Return n places on a circle, (n, 2), from the top clockwise."""
+    angle = 2 * np.pi * np.arange(n) / n
     return np.stack([np.sin(angle), np.cos(angle)], axis=1)
+
+
+def arc(start: np.ndarray, end: np.ndarray, points: int = POINTS) -> np.ndarray:
+    """Return points of the arc from a place to another, (points, 2)."""
+    t = np.linspace(0.0, 1.0, points)[:, None]
+    middle = (start + end) / 2 + 2 * BEND * np.array([end[1] - start[1], start[0] - end[0]])
+    return (1 - t) ** 2 * start + 2 * t * (1 - t) * middle + t**2 * end
 
 
 def _limits(found: Links) -> tuple[np.ndarray, np.ndarray]:
@@ -136,20 +147,20 @@ def _says(found: Links) -> list[str]:
     return [f"{way}links from µ = {LEAST:g} on{above}"]
 
 
-def _legend(found: Links) -> list[Any]:
-    from matplotlib.lines import Line2D
-
-    return [Line2D([], [], **_ink(µ), label=f"µ = {µ:g}") for µ in (1.0, 0.75, 0.5, 0.25, 0.05)]
-
-
 def _ink(µ: float) -> dict[str, Any]:
     """Colour and width of a link."""
     return {"color": str(round(0.82 * (1.0 - µ), 3)), "linewidth": 0.4 + 2.2 * µ}
 
 
-def _draw_panel(axes: Any, panel: _NetworkPanel, found: Links) -> list[_Arc]:
+def _draw_panel(axes: Any, panel: _NetworkPanel, found: Links) -> Callable[[], None]:
+    """Draw a panel, and return what names its agents."""
     from matplotlib.collections import LineCollection
 
+    low, high = _limits(found)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    axes.set_title(panel.title, fontsize="small")
+    if not found.places:
+        axes.set_axis_off()
     for place in found.places:
         if place.ndim == 2:
             axes.plot(place[:, 0], place[:, 1], color="0.9", linewidth=4, zorder=1, solid_capstyle="round")
@@ -157,15 +168,9 @@ def _draw_panel(axes: Any, panel: _NetworkPanel, found: Links) -> list[_Arc]:
                 axes.plot(*end[:2], mark, markersize=4, markerfacecolor="w", markeredgecolor="0.45", zorder=2)
     arcs = sorted(_arcs(panel), key=lambda arc: arc.link)
     inks = [_ink(arc.link) for arc in arcs]
-    axes.add_collection(
-        LineCollection(
-            [arc.line for arc in arcs],
-            colors=[ink["color"] for ink in inks],
-            linewidths=[ink["linewidth"] for ink in inks],
-            capstyle="round",
-            zorder=3,
-        )
-    )
+    colors, widths = [ink["color"] for ink in inks], [ink["linewidth"] for ink in inks]
+    lines = [arc.line for arc in arcs]
+    axes.add_collection(LineCollection(lines, colors=colors, linewidths=widths, capstyle="round", zorder=3))
     for arc, ink in zip(arcs, inks, strict=True) if not panel.alike else ():
         tip = arc.line[-POINTS // 6]
         way = tip - arc.line[-POINTS // 6 - 3]
@@ -174,21 +179,13 @@ def _draw_panel(axes: Any, panel: _NetworkPanel, found: Links) -> list[_Arc]:
         axes.plot(*tip, **head, color=ink["color"], zorder=4)
     axes.plot(*panel.places.T, "o", color="k", markersize=6.5, markeredgecolor="w", zorder=5)
     axes.tick_params(labelsize="x-small")
-    return arcs
+    return lambda: _name(axes, panel, arcs, found)
 
 
 def _arcs(panel: _NetworkPanel) -> list[_Arc]:
     """Links as arcs from sender to receiver; one for both ways where all are alike."""
-    arcs, t = [], np.linspace(0.0, 1.0, POINTS)[:, None]
-    for i, j in np.argwhere(panel.link >= LEAST):
-        if panel.alike and i < j:
-            continue
-        start, end = panel.places[j], panel.places[i]
-        across = np.array([end[1] - start[1], start[0] - end[0]])
-        middle = (start + end) / 2 + 2 * BEND * across
-        line = (1 - t) ** 2 * start + 2 * t * (1 - t) * middle + t**2 * end
-        arcs.append(_Arc(line, float(panel.link[i, j])))
-    return arcs
+    drawn = [(i, j) for i, j in np.argwhere(panel.link >= LEAST) if i >= j or not panel.alike]
+    return [_Arc(arc(panel.places[j], panel.places[i]), float(panel.link[i, j])) for i, j in drawn]
 
 
 def _labels(found: Links, panel: _NetworkPanel) -> list[str]:

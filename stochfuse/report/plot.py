@@ -16,7 +16,8 @@ import numpy as np
 from stochfuse.errors import needed
 from stochfuse.report.table import write_file
 
-MOST_CURVES = 8
+MOST_CURVES, MOST_MARKED = 8, 30
+"""Curves of a figure, and points up to which a curve has marks."""
 MARKERS = "osD^vP*X"
 DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (3, 3)))
 """Patterns of lines, so that curves are told apart without colour."""
@@ -50,6 +51,45 @@ def save(draw: Callable[[], Any], output: Path) -> None:
     figure_class()
     figure = draw()
     write_file(output, lambda path: figure.savefig(path, dpi=150))
+
+
+def canvas(width: float, height: float, layout: str = "constrained") -> Any:
+    """Return an empty figure of a size in inches, not registered with pyplot."""
+    return figure_class()(figsize=(width, height), layout=layout)
+
+
+def look(place: int) -> dict[str, Any]:
+    """Colour and dashes of one of several curves."""
+    return {"color": COLORS[place % len(COLORS)], "linestyle": DASHES[place % len(DASHES)]}
+
+
+def entry(label: str, **style: Any) -> Any:
+    """Return an entry of a legend that no single curve stands for."""
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], label=label, **style)
+
+
+def band(axes: Any, x: Any, low: Any, high: Any, color: Any, alpha: float = 0.15) -> None:
+    """Lay a pale band between two curves."""
+    axes.fill_between(x, low, high, color=color, alpha=alpha, linewidth=0)
+
+
+def labelled(axes: Any, x: str | None, y: str | None, *, whole: bool = False, zero: bool = False) -> None:
+    """Name axes and lay a grid under them.
+
+    Parameters
+    ----------
+    x, y : names; None leaves an axis as it is.
+    whole : whether x has whole numbers only.
+    zero : whether y begins at 0.
+    """
+    axes.set(**{key: text for key, text in (("xlabel", x), ("ylabel", y)) if text is not None})
+    if whole:
+        axes.xaxis.get_major_locator().set_params(integer=True)
+    if zero:
+        axes.set_ylim(bottom=0)
+    axes.grid(alpha=0.3)
 
 
 def spread(n: int) -> list[int]:

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse import __version__
 from stochfuse.engines.distribution import parse_statistic
 from stochfuse.errors import StochfuseError, UsageError
 from stochfuse.kalman.metrics import Metric, power
@@ -22,9 +21,9 @@ from stochfuse.prediction.quantities import OVERCONFIDENT, expectation, noun, ti
 from stochfuse.prediction.quantities import unit as unit_of
 from stochfuse.prediction.result import Limit, Prediction
 from stochfuse.prediction.swept import Swept
-from stochfuse.report.plot import DASHES, MARKERS, below, direct, figure_class, shades, spread, titled
-from stochfuse.report.rows import Curves, ResultRows
-from stochfuse.report.table import Report, Table, number, to_csv
+from stochfuse.report.plot import DASHES, MARKERS, MOST_MARKED, band, below, canvas, direct, entry, labelled, titled
+from stochfuse.report.rows import ResultRows, ShownCurve, whose
+from stochfuse.report.table import Report, Table, counted, listed, number, stamped, to_csv
 from stochfuse.scenario.registry import OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.registry import title as method_title
 
@@ -175,6 +174,20 @@ class PredictionView:
         each = zip(values, np.zeros(len(values)) if errors is None else errors, strict=True)
         return [number(value, self.digits) + (f" ±{error:.2g}" if error else "") for value, error in each]
 
+    def cells(self, *, sure: bool = True) -> list[list[str]]:
+        """Return the values as they are shown, of every row and step; `sure`: with standard errors and intervals."""
+        values, errors, ends = self.values(), self.errors(), self.ends()
+        shown = []
+        for i, row in enumerate(values):
+            cells = [number(value, self.digits) for value in row]
+            if sure and errors is not None:
+                cells = [f"{cell} {plus_minus(*each)}" for cell, *each in zip(cells, errors[i], row, strict=True)]
+            if sure and ends is not None:
+                low, high = ([number(end, self.digits) for end in each[i]] for each in ends)
+                cells = [f"{cell} [{a}, {b}]" for cell, a, b in zip(cells, low, high, strict=True)]
+            shown.append(cells)
+        return shown
+
     def _normalised(self, values: np.ndarray, by: np.ndarray | None) -> np.ndarray:
         if by is None:
             return values
@@ -220,11 +233,7 @@ class PredictionView:
     @property
     def whom(self) -> str:
         """One line: the scenario and whose covariance."""
-        scenario = self.prediction.scenario
-        numbers = [part.scenario.network.agents for part in self.parts]
-        n = f"{min(numbers)} to " * (len(set(numbers)) > 1) + str(max(numbers))
-        agents = f"{n} agent{'s' * (max(numbers) > 1)}, {scenario.network.architecture}{self._links}"
-        return f"{scenario.name}: {agents}; {self._of}{self.rows.common}"
+        return f"{self.rows.agents}{self._links}; {self._of}{self.rows.common}"
 
     @property
     def _links(self) -> str:
@@ -237,13 +246,8 @@ class PredictionView:
     def _of(self) -> str:
         if self.prediction.alike:
             return "every agent alike" if any(len(part.group_of) > 1 for part in self.parts) else "alone"
-        random = self.statistic not in ("mean", "derivative")
-        texts = {
-            "mean": "of an agent picked at random" if random else "covariance averaged over the agents",
-            "worst": "the agent with the largest value",
-            "best": "the agent with the smallest value",
-        }
-        return texts.get(str(self.agent), f"agent {self.agent}")
+        random = self.statistic not in ("mean", "derivative") and self.agent == "mean"
+        return "of an agent picked at random" if random else whose(self.agent)
 
     @property
     def how(self) -> str:
@@ -279,12 +283,6 @@ class PredictionView:
         return f"approximate{everything} less those of probability up to {np.max(p.meta['left_out']):.2g}"
 
 
-def counted(number: int, what: str) -> str:
-    """Return a number with its noun."""
-    shown = f"{number:,}" if number < 10**15 else f"{number:.3g}"
-    return f"{shown} {what}{'s' * (number != 1)}"
-
-
 def _finite(values: np.ndarray) -> np.ndarray:
     if not np.isfinite(values).all():
         raise StochfuseError("the prediction is not finite: the values grow beyond floating point")
@@ -300,17 +298,11 @@ def report(views: Sequence[PredictionView]) -> Report:
 
 def predict_table(view: PredictionView) -> Table:
     """Return rows of link probabilities (or cases) against columns of steps."""
-    values, errors, steady, ends = view.values(), view.errors(), view.steady_cells, view.ends()
+    steady, cells = view.steady_cells, view.cells()
     columns = [f"k={k}" for k in view.steps] + (["steady"] if steady is not None else [])
     rows = []
     for i, there in enumerate(view.there):
-        shown = [number(v, view.digits) for v in values[i]]
-        if errors is not None:
-            told = map(plus_minus, errors[i], values[i])
-            shown = [f"{value} {error}" for value, error in zip(shown, told, strict=True)]
-        if ends is not None:
-            shown = [f"{value} {_between(*pair, view.digits)}" for value, *pair in zip(shown, *(e[i] for e in ends))]  # noqa: B905
-        shown = [value if is_there else "" for value, is_there in zip(shown, there, strict=True)]
+        shown = [cell if is_there else "" for cell, is_there in zip(cells[i], there, strict=True)]
         rows.append((*view.rows.cells(i), *shown, *([] if steady is None else [steady[i]])))
     return Table((view.what, view.whom, view.how), view.rows.keys, tuple(columns), tuple(rows), over="k")
 
@@ -318,20 +310,6 @@ def predict_table(view: PredictionView) -> Table:
 def plus_minus(error: float, value: float) -> str:
     """A standard error for people; what is no more than rounding is nothing."""
     return f"±{error if abs(error) > NOTHING * abs(value) else 0.0:.2g}"
-
-
-def _between(low: float, high: float, digits: int) -> str:
-    return f"[{number(low, digits)}, {number(high, digits)}]"
-
-
-def listed(values: np.ndarray) -> Any:
-    """Nested lists of numbers for JSON, null for what a row does not have."""
-    missing = np.isnan(values)
-    if not missing.any():
-        return values.tolist()
-    out = values.astype(object)
-    out[missing] = None
-    return out.tolist()
 
 
 def predict_csv(view: PredictionView) -> str:
@@ -343,20 +321,21 @@ def predict_csv(view: PredictionView) -> str:
     labels = (p.method, p.quantity, p.stage, p.nature, metric, view.unit, view.agent)
     natures = [limit.prediction.nature for limit in view.limits for _ in limit.prediction.link]
     rows, ends, steady_error = [], view.ends(), view.steady_error()
-    sampled = errors is not None or steady_error is not None
+    more: dict[str, np.ndarray | None] = {}
+    if ends is not None:
+        more = {"low": ends[0], "high": ends[1]}
+    elif errors is not None or steady_error is not None:
+        more = {"standard_error": errors}
     for i, there in enumerate(view.there):
         record = view.rows.record(i)
-        error: list[Any] = [
-            ("",) * sampled if errors is None else (float(e),) for e in (there if errors is None else errors[i])
-        ]
-        if ends is not None:
-            error = [(float(low), float(high)) for low, high in zip(ends[0][i], ends[1][i], strict=True)]
-        rows += [(*labels, *record, int(view.steps[c]), float(values[i, c]), *error[c]) for c in np.flatnonzero(there)]
+        for c in np.flatnonzero(there):
+            error = (None if each is None else float(each[i, c]) for each in more.values())
+            rows.append((*labels, *record, int(view.steps[c]), float(values[i, c]), *error))
         if steady is not None:
-            own = ("",) * len(error[0]) if steady_error is None else (float(steady_error[i]),)
-            rows.append((*labels[:3], natures[i], *labels[4:], *record, "steady", float(steady[i]), *own))
+            # a limit has no interval
+            error = (None if ends is not None or steady_error is None else float(steady_error[i]) for _ in more)
+            rows.append((*labels[:3], natures[i], *labels[4:], *record, "steady", float(steady[i]), *error))
     what = ("method", "quantity", "stage", "nature", "metric", "unit", "agent")
-    more = ("low", "high") if ends is not None else ("standard_error",) * sampled
     return to_csv((*what, *view.rows.headings, "step", "value", *more), rows)
 
 
@@ -364,17 +343,16 @@ def predict_json(view: PredictionView) -> dict[str, Any]:
     """Return the object of schema stochfuse.prediction/1."""
     p = view.prediction
     model, steady = p.scenario.model, view.steady()
-    result: dict[str, Any] = {
-        "schema": SCHEMA,
-        "version": __version__,
-        "method": p.method,
-        "quantity": p.quantity,
-        "metric": view.metric.name,
+    result = stamped(
+        SCHEMA,
+        method=p.method,
+        quantity=p.quantity,
+        metric=view.metric.name,
         **view.rows.facts,
-        "steps": view.steps.tolist(),
-        "values": listed(view.values()),
-        "scenario": p.scenario.to_mapping(),
-        "meta": {
+        steps=view.steps.tolist(),
+        values=listed(view.values()),
+        scenario=p.scenario.to_mapping(),
+        meta={
             "description": [view.what, view.whom, view.how],
             "stage": p.stage,
             "nature": p.nature,
@@ -388,7 +366,7 @@ def predict_json(view: PredictionView) -> dict[str, Any]:
             "estimator": p.estimator,
             **p.meta,
         },
-    }
+    )
     if view.statistic != "mean":
         result["statistic"] = view.statistic
     errors, ends = view.errors(), view.ends()
@@ -397,11 +375,8 @@ def predict_json(view: PredictionView) -> dict[str, Any]:
     if errors is not None:
         half = WIDTH_95 * errors
         result["standard_error"] = listed(errors)
-        result["interval"] = {
-            "level": LEVEL,
-            "low": listed(view.values() - half),
-            "high": listed(view.values() + half),
-        }
+        low, high = listed(view.values() - half), listed(view.values() + half)
+        result["interval"] = {"level": LEVEL, "low": low, "high": high}
     elif isinstance(p, Prediction) and view.metric.linear and view.statistic == "mean" and not view.baseline:
         polynomials = p.polynomials(view.metric, view.agent)
         if polynomials is not None:
@@ -417,8 +392,7 @@ def _steady_json(view: PredictionView, steady: np.ndarray) -> dict[str, Any]:
     found: dict[str, Any] = {"steady": steady.tolist()}
     limits = view.limits
     if view.prediction.steady_bound is not None:
-        worst = view.prediction.steady_bound.max(axis=1)
-        found["steady_relative_bound"] = [float(b) if np.isfinite(b) else None for b in worst]
+        found["steady_relative_bound"] = listed(view.prediction.steady_bound.max(axis=1))
     errors = view.steady_error()
     if errors is not None:
         found["steady_standard_error"] = errors.tolist()
@@ -434,25 +408,16 @@ RATIO = "actual / claimed"
 
 def side_table(views: Sequence[PredictionView]) -> Table:
     """Return rows of link probability and step, columns of quantities."""
-    values, errors = [view.values() for view in views], [view.errors() for view in views]
-    ends = [view.ends() for view in views]
-    rows, names, digits = [], views[0].rows, views[0].digits
+    cells, steady = [view.cells() for view in views], [view.steady_cells for view in views]
+    rows, names = [], views[0].rows
     for i, there in enumerate(views[0].there):
         for k in np.flatnonzero(there):
-            cells = [
-                number(value[i, k], digits)
-                + ("" if error is None else f" ±{error[i, k]:.2g}")
-                + ("" if end is None else f" {_between(end[0][i, k], end[1][i, k], digits)}")
-                for value, error, end in zip(values, errors, ends, strict=True)
-            ]
-            rows.append((*names.cells(i), str(views[0].steps[k]), *cells))
-        steady = [view.steady_cells for view in views]
+            rows.append((*names.cells(i), str(views[0].steps[k]), *(shown[i][k] for shown in cells)))
         if any(steady):
             rows.append((*names.cells(i), "steady", *("" if found is None else found[i] for found in steady)))
-    keys = (*names.keys, "k")
     how = dict.fromkeys(view.how for view in views)
     titles = (*(view.what for view in views), views[0].whom, *how)
-    return Table(titles, keys, tuple(view.prediction.quantity for view in views), tuple(rows))
+    return Table(titles, (*names.keys, "k"), tuple(view.prediction.quantity for view in views), tuple(rows))
 
 
 def side_csv(views: Sequence[PredictionView]) -> str:
@@ -477,39 +442,23 @@ def side_json(views: Sequence[PredictionView]) -> dict[str, Any]:
     }
 
 
-def draw_side(views: Sequence[PredictionView]):
+def draw_side(views: Sequence[PredictionView]) -> Any:
     """Return the figure, one panel for each unit."""
-    from matplotlib.lines import Line2D
-
     curves = views[0].rows.curves(views[0].steps)
-    chosen = spread(len(curves.names))
     units = list(dict.fromkeys(_axis(view) for view in views))
-    figure = figure_class()(figsize=(1.5 + 5.0 * len(units), 5.6), layout="constrained")
+    figure = canvas(1.5 + 5.0 * len(units), 5.6)
     panels = dict(zip(units, figure.subplots(1, len(units), squeeze=False)[0], strict=True))
-    colors = shades(len(chosen))
-    for v, view in enumerate(views):
-        axes = panels[_axis(view)]
-        for c, color in zip(chosen, colors, strict=True):
-            _curve(axes, view, curves, c, color=color, linestyle=STYLES[v % 4], marker=MARKERS[v])
+    styles: list[dict[str, Any]] = [{"linestyle": STYLES[v % 4], "marker": MARKERS[v]} for v in range(len(views))]
+    for view, style in zip(views, styles, strict=True):
+        for curve in curves.shown():
+            _curve(panels[_axis(view)], view, curve, **style)
     for label, axes in panels.items():
         shown = [view for view in views if _axis(view) == label]
-        _dress(axes, curves, label, zero=label != RATIO and all(np.nanmin(view.values()) >= 0 for view in shown))
-    quantities = [
-        Line2D(
-            [], [], color="0.2", linestyle=STYLES[v % 4], marker=MARKERS[v], markersize=4, label=w.prediction.quantity
-        )
-        for v, w in enumerate(views)
-    ]
-    below(
-        figure,
-        [
-            *quantities,
-            *(
-                Line2D([], [], color=color, linewidth=3, label=curves.names[c])
-                for c, color in zip(chosen, colors, strict=True)
-            ),
-        ],
-    )
+        zero = label != RATIO and all(np.nanmin(view.values()) >= 0 for view in shown)
+        labelled(axes, curves.label, label, whole=curves.whole, zero=zero)
+    each = zip(views, styles, strict=True)
+    quantities = [entry(view.prediction.quantity, color="0.2", markersize=4, **style) for view, style in each]
+    below(figure, [*quantities, *curves.entries()])
     p, at = views[0].prediction, f", {curves.at}" if curves.at else ""
     sampled = "; bands: 95 % confidence" if views[0].sampled else ""
     how = dict.fromkeys(f"{view.how}{sampled}" for view in views)
@@ -521,9 +470,9 @@ def _axis(view: PredictionView) -> str:
     return RATIO if view.prediction.quantity == "consistency" else view.axis
 
 
-def draw(view: PredictionView):
+def draw(view: PredictionView) -> Any:
     """Return the figure, not shown and not registered with pyplot."""
-    figure = figure_class()(figsize=(7.5, 5.0), layout="constrained")
+    figure = canvas(7.5, 5.0)
     at = draw_on(figure.add_subplot(), view)
     bars = "; bands: 95 % confidence" if view.sampled else ""
     titled(figure, view.what + (f", {at}" if at else ""), view.whom, view.how.replace("; [ ]:", "; band:") + bars)
@@ -537,65 +486,44 @@ def draw_on(axes: Any, view: PredictionView) -> str:
     row.
     """
     curves = view.rows.curves(view.steps)
-    chosen = spread(len(curves.names))
+    shown, whole = curves.shown(), len(curves.names)
     fine = _smooth(view) if curves.what == "steps" and view.rows.over is None else None
     lines = [
-        _curve(axes, view, curves, c, color=color, linestyle=DASHES[i], marker=MARKERS[i], fine=fine)
-        for i, (c, color) in enumerate(zip(chosen, shades(len(chosen)), strict=True))
+        _curve(axes, view, curve, fine=fine, linestyle=DASHES[i], marker=MARKERS[i]) for i, curve in enumerate(shown)
     ]
-    if view.statistic == "mean":
-        label = view.axis
-    else:
+    label = view.axis
+    if view.statistic != "mean":
         label = "\n".join(wrap(view.what.partition(": ")[2].partition(" [no unit")[0], 45))
-    _dress(axes, curves, label, zero=np.nanmin(view.values()) >= 0)
-    whole = len(curves.names)
-    direct(
-        axes,
-        lines,
-        [curves.names[c] for c in chosen],
-        None if len(chosen) == whole else f"{len(chosen)} of {whole} {curves.what}",
-    )
+    labelled(axes, curves.label, label, whole=curves.whole, zero=np.nanmin(view.values()) >= 0)
+    left_out = f"{len(shown)} of {whole} {curves.what}" if len(shown) < whole else None
+    direct(axes, lines, [curve.name for curve in shown], left_out)
     return curves.at
 
 
 def _curve(
     axes: Any,
     view: PredictionView,
-    curves: Curves,
-    c: int,
+    curve: ShownCurve,
     *,
     fine: PredictionView | None = None,
     marker: str,
-    **style: Any,
+    linestyle: Any,
 ) -> Any:
     """Draw one curve: a line, the asked points, a band."""
-    values, errors, ends, x = view.values(), view.errors(), view.ends(), curves.x[c]
-    y = values[curves.picks[c]]
-    few = len(x) <= 30
+    x, y, errors, ends = curve.x, view.values()[curve.pick], view.errors(), view.ends()
+    color, points = curve.color, {"marker": marker if len(curve.x) <= MOST_MARKED else None, "markersize": 4}
     if fine is None:
-        (line,) = axes.plot(x, y, marker=marker if few else None, markersize=4, **style)
+        (line,) = axes.plot(x, y, color=color, linestyle=linestyle, **points)
     else:
-        (line,) = axes.plot(fine.prediction.link, fine.values()[:, c], **style)
-        axes.plot(x, y, linestyle="none", marker=marker if few else None, markersize=4, color=style["color"])
+        _, step = curve.pick
+        (line,) = axes.plot(fine.prediction.link, fine.values()[:, step], color=color, linestyle=linestyle)
+        axes.plot(x, y, linestyle="none", color=color, **points)
     if errors is not None:
-        reach = WIDTH_95 * errors[curves.picks[c]]
-        axes.fill_between(x, y - reach, y + reach, color=style["color"], alpha=0.2, linewidth=0)
+        reach = WIDTH_95 * errors[curve.pick]
+        band(axes, x, y - reach, y + reach, color, 0.2)
     if ends is not None:
-        low, high = (end[curves.picks[c]] for end in ends)
-        axes.fill_between(x, low, high, color=style["color"], alpha=0.2, linewidth=0)
+        band(axes, x, ends[0][curve.pick], ends[1][curve.pick], color, 0.2)
     return line
-
-
-def _dress(axes: Any, curves: Curves, label: str, *, zero: bool) -> None:
-    from matplotlib.ticker import MaxNLocator
-
-    axes.set_ylabel(label)
-    axes.set_xlabel(curves.label)
-    if curves.whole:
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    if zero:
-        axes.set_ylim(bottom=0)
-    axes.grid(alpha=0.3)
 
 
 SMOOTH = 101

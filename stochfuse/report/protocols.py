@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse import __version__
 from stochfuse.data.protocols import ProtocolLoad, SampledLoad
 from stochfuse.kalman.metrics import Metric
 from stochfuse.prediction import quantities
-from stochfuse.report.plot import COLORS, MARKERS, below, figure_class, titled
+from stochfuse.report.plot import COLORS, MARKERS, below, canvas, labelled, titled
 from stochfuse.report.rows import ResultRows
-from stochfuse.report.table import Report, Table, number, to_csv
+from stochfuse.report.table import Report, Table, number, records_csv, stamped
 from stochfuse.scenario import registry
 
 SCHEMA = "stochfuse.messages/1"
@@ -102,31 +101,24 @@ def _cell(shown: SampledLoad, row: int, digits: int) -> str:
 
 
 def _csv(view: ProtocolView) -> str:
-    headings = [
-        "protocol",
-        "missing",
-        "estimator",
-        "nature",
-        "runs",
-        "agent",
-        *view.rows.headings,
-        "from_step",
-        "to_step",
-    ]
-    for name in ("nodes", "bytes", "apart"):
-        headings += [name, f"{name}_standard_error"]
-    headings += [] if view.metric is None else ["metric", "quantity", "accuracy", "accuracy_standard_error"]
-    rows, f = [], view.found
+    records, f = [], view.found
     first, last = map(int, f.steps[[0, -1]])
     for p, name in enumerate(f.protocols):
-        loads, accuracy = [f.load(p, what, view.agent) for what in ("nodes", "bytes", "apart")], view.accuracy(p)
+        sampled = {what: f.load(p, what, view.agent) for what in ("nodes", "bytes", "apart")}
         for row in range(len(f.link)):
-            cells = [name, f.missing, f.estimator, "sampled", f.runs, view.agent, *view.rows.record(row), first, last]
-            cells += [float(part[row]) for each in loads for part in each]
+            record = {"protocol": name, "missing": f.missing, "estimator": f.estimator, "nature": "sampled"}
+            record |= {"runs": f.runs, "agent": view.agent}
+            record |= dict(zip(view.rows.headings, view.rows.record(row), strict=True))
+            record |= {"from_step": first, "to_step": last}
+            accuracy = view.accuracy(p)
+            for what, each in sampled.items():
+                record |= {what: float(each.values[row]), f"{what}_standard_error": float(each.error[row])}
             if accuracy is not None and view.metric is not None:
-                cells += [view.metric.name, view.quantity, *(float(part[row]) for part in accuracy)]
-            rows.append(tuple(cells))
-    return to_csv(headings, rows)
+                record |= {"metric": view.metric.name, "quantity": view.quantity}
+                record |= {"accuracy": float(accuracy.values[row])}
+                record |= {"accuracy_standard_error": float(accuracy.error[row])}
+            records.append(record)
+    return records_csv(tuple(records[0]), records)
 
 
 def _json(view: ProtocolView) -> dict[str, Any]:
@@ -155,25 +147,24 @@ def _json(view: ProtocolView) -> dict[str, Any]:
                 "standard_error": accuracy.error.tolist(),
             }
         each.append(entry)
-    return {
-        "schema": SCHEMA,
-        "version": __version__,
+    return stamped(
+        SCHEMA,
         **view.rows.facts,
-        "steps": f.steps.tolist(),
+        steps=f.steps.tolist(),
         **each[0],
-        "protocols": each,
-        "estimator": f.estimator,
-        "runs": f.runs,
-        "seed": f.seed,
-        "missing": f.missing,
-        "scenario": f.scenario.to_mapping(),
-        "meta": {"description": list(view.titles), "agent": view.agent},
-    }
+        protocols=each,
+        estimator=f.estimator,
+        runs=f.runs,
+        seed=f.seed,
+        missing=f.missing,
+        scenario=f.scenario.to_mapping(),
+        meta={"description": list(view.titles), "agent": view.agent},
+    )
 
 
 def _draw(view: ProtocolView) -> Any:
     """Accuracy against bytes, a curve for each protocol; without an accuracy bytes against link probability."""
-    figure = figure_class()(figsize=(7.5, 5.0), layout="constrained")
+    figure = canvas(7.5, 5.0)
     axes, f = figure.add_subplot(), view.found
     order = np.argsort(f.link)
     for p, name in enumerate(f.protocols):
@@ -182,12 +173,11 @@ def _draw(view: ProtocolView) -> Any:
         style = {"marker": MARKERS[p % len(MARKERS)], "color": COLORS[p % len(COLORS)], "capsize": 2, "label": name}
         axes.errorbar(x[order], y.values[order], 1.96 * y.error[order], **style)
     if view.metric is None:
-        axes.set(xlabel="link probability µ", ylabel="bytes a step (bars: 95 %)")
+        labelled(axes, "link probability µ", "bytes a step (bars: 95 %)")
     else:
         unit = quantities.unit(view.quantity, view.metric)
         shown = f"{view.quantity} {quantities.noun(view.quantity, view.metric)}{f' [{unit}]' if unit else ''}"
-        axes.set(xlabel="bytes a step", ylabel=f"{shown} (bars: 95 %)")
-    axes.grid(alpha=0.3)
+        labelled(axes, "bytes a step", f"{shown} (bars: 95 %)")
     below(figure)
-    titled(figure, view.titles[0], *view.titles[1:])
+    titled(figure, *view.titles)
     return figure

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse import __version__
-from stochfuse.report.plot import DASHES, MARKERS, figure_class, shades, titled
-from stochfuse.report.table import Report, Table, number, to_csv
+from stochfuse.report.plot import DASHES, MARKERS, band, canvas, labelled, shades, titled
+from stochfuse.report.table import Report, Table, number, stamped, to_csv
 
 SCHEMA = "stochfuse.reproduction/1"
 VERDICTS = ("agrees", "differs", "explained", "open")
@@ -150,7 +149,7 @@ def findings_report(findings: Sequence[Finding], title: Sequence[str] = ()) -> R
     """Return statements of the thesis beside our numbers in every form."""
     rows = [(" ".join(f.items), f.thesis, f.ours, f.criterion, f.verdict) for f in findings]
     csv = partial(to_csv, ("items", "thesis", "ours", "criterion", "verdict"), rows)
-    record = {**_head("statements"), "verdicts": MEANING, "statements": list(map(asdict, findings))}
+    record = stamped(SCHEMA, what="statements", verdicts=MEANING, statements=list(map(asdict, findings)))
     return Report(partial(findings_table, findings, title), csv, lambda: record)
 
 
@@ -158,7 +157,7 @@ def listing_report(entries: Sequence[tuple[str, str]]) -> Report:
     """Return what can be reproduced in every form."""
     title = ("What of the thesis can be reproduced: `stochfuse reproduce KEY`",)
     table = Table(title, ("key", "what it shows"), (), tuple(entries))
-    record = {**_head("list"), "items": [{"key": key, "title": what} for key, what in entries]}
+    record = stamped(SCHEMA, what="list", items=[{"key": key, "title": what} for key, what in entries])
     return Report(lambda: table, partial(to_csv, ("key", "title"), entries), lambda: record)
 
 
@@ -171,7 +170,7 @@ def timing_report(rows: Sequence[tuple[str, float | None, float]]) -> Report:
     keys = ("work", "thesis_s", "here_s")
     cells = tuple((work, "-" if there is None else f"{there:,.0f}", f"{here:.4g}") for work, there, here in rows)
     table = Table(title, ("work",), ("thesis [s]", "here [s]"), cells)
-    record = {**_head("timing"), "rows": [dict(zip(keys, row, strict=True)) for row in rows]}
+    record = stamped(SCHEMA, what="timing", rows=[dict(zip(keys, row, strict=True)) for row in rows])
     return Report(lambda: table, partial(to_csv, keys, rows), lambda: record)
 
 
@@ -211,18 +210,15 @@ def _sheet_csv(sheet: Sheet) -> str:
 
 
 def _sheet_json(sheet: Sheet) -> dict[str, Any]:
-    return {
-        **_head(sheet.key),
-        "title": sheet.title,
-        "notes": list(sheet.notes),
-        "panels": [_panel_json(panel) for panel in sheet.panels],
-        "facts": [{"name": name, "thesis": there, "here": here} for name, there, here in sheet.facts],
-        "statements": list(map(asdict, sheet.findings)),
-    }
-
-
-def _head(what: str) -> dict[str, Any]:
-    return {"schema": SCHEMA, "version": __version__, "what": what}
+    return stamped(
+        SCHEMA,
+        what=sheet.key,
+        title=sheet.title,
+        notes=list(sheet.notes),
+        panels=[_panel_json(panel) for panel in sheet.panels],
+        facts=[{"name": name, "thesis": there, "here": here} for name, there, here in sheet.facts],
+        statements=list(map(asdict, sheet.findings)),
+    )
 
 
 def _panel_json(panel: Panel) -> dict[str, Any]:
@@ -242,7 +238,7 @@ def draw(sheet: Sheet):
     """Return the figure, not shown and not registered with pyplot."""
     n = max(1, len(sheet.panels))
     columns = min(n, 2)
-    figure = figure_class()(figsize=(6.2 * columns + 0.6, 4.6 * -(-n // columns) + 0.6), layout="constrained")
+    figure = canvas(6.2 * columns + 0.6, 4.6 * -(-n // columns) + 0.6)
     titled(figure, f"Thesis {name_of(sheet.key)}: {sheet.title}")
     for i, panel in enumerate(sheet.panels, start=1):
         _draw_panel(figure.add_subplot(-(-n // columns), columns, i), panel)
@@ -261,14 +257,12 @@ def _draw_panel(axes, panel: Panel) -> None:
         style |= {"linestyle": DASHES[i % len(DASHES)], "marker": MARKERS[i % len(MARKERS)], "markersize": 4}
         axes.plot(x, curve.y, **style)
         if curve.low is not None and curve.high is not None:
-            axes.fill_between(x, curve.low, curve.high, color=color, alpha=0.15, linewidth=0)
+            band(axes, x, curve.low, curve.high, color)
     if all(curve.at is None for curve in panel.curves):
         axes.set_xticks(panel.x, panel.points)
-    axes.set_xlabel(panel.x_label)
-    axes.set_ylabel("\n".join(wrap(panel.y_label, 45)))
+    labelled(axes, panel.x_label, "\n".join(wrap(panel.y_label, 45)))
     if panel.y_range is not None:
         axes.set_ylim(*panel.y_range)
     axes.set_title("\n".join(wrap(panel.title, 60)), fontsize="small")
-    axes.grid(alpha=0.3)
     few = len(panel.curves) <= 4 or len(panel.points) > 6
     axes.legend(fontsize="x-small", loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2 if few else 3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,8 @@ from stochfuse.prediction.compare import Comparison, EstimatorComparison
 from stochfuse.prediction.expected_states import ExpectedStates
 from stochfuse.prediction.result import Prediction
 from stochfuse.prediction.swept import Swept
-from stochfuse.questions.agents_needed import AgentsNeeded
 from stochfuse.questions.critical import Critical
-from stochfuse.questions.least_link import LeastLink
-from stochfuse.questions.least_value import LeastValue
 from stochfuse.questions.messages import MessageLoad, SweptLoad
-from stochfuse.questions.sensitivity import Sensitivity, ShareOfGain
 from stochfuse.report import (
     comparisons,
     crosschecks,
@@ -46,13 +43,18 @@ from stochfuse.scenario.links import Links
 from stochfuse.scenario.over import Over
 from stochfuse.studies.files import Results
 
-SHEETS = {
-    AgentsNeeded: solutions.agents_sheet,
-    LeastLink: solutions.least_link_sheet,
-    LeastValue: solutions.value_sheet,
-    Sensitivity: solutions.sensitivity_sheet,
-    ShareOfGain: solutions.gain_sheet,
+REPORTS: dict[Any, Callable[[Any], Report]] = {
+    Critical: critical_report,
+    ProtocolLoad: lambda found: protocols.protocol_report(protocols.ProtocolView(found)),
+    MessageLoad: lambda found: messages.load_report(messages.LoadView((found,), found)),
+    SweptLoad: lambda found: messages.load_report(messages.LoadView((found,), found)),
+    Results: lambda found: study_figures.summary_report(found, 5),
+    Links: links.links_report,
+    RunResult: run_report,
+    RobotRun: robot_report,
+    Verdict: lambda found: crosschecks.crosscheck_report(crosschecks.CrosscheckView(found)),
 }
+"""What shows a result that is shown in one way only."""
 
 
 def report_of(result: Any, of: str | None = None, agent: int | str = "mean") -> Report:
@@ -63,27 +65,13 @@ def report_of(result: Any, of: str | None = None, agent: int | str = "mean") -> 
     of : metric of the covariance; default: the scenario's, else trace.
     agent : "mean", "worst", "best" or a number from 1.
     """
-    sheet = SHEETS.get(type(result))
-    if sheet is not None:
-        return solutions.solution_report(sheet(result), result)
-    if isinstance(result, Critical):
-        return critical_report(result)
-    if isinstance(result, ProtocolLoad):
-        return protocols.protocol_report(protocols.ProtocolView(result))
-    if isinstance(result, MessageLoad | SweptLoad):
-        return messages.load_report(messages.LoadView((result,), result))
-    if isinstance(result, Results):
-        return study_figures.summary_report(result, 5)
-    if isinstance(result, Links):
-        return links.links_report(result)
-    if isinstance(result, RunResult):
-        return run_report(result)
-    if isinstance(result, RobotRun):
-        return robot_report(result)
+    if type(result) in solutions.SHEETS:
+        return solutions.solution_report(solutions.sheet_of(result), result)
+    for kind, report in REPORTS.items():
+        if isinstance(result, kind):
+            return report(result)
     if isinstance(result, ExpectedStates):
         return states_report(StatesView(result, agent))
-    if isinstance(result, Verdict):
-        return crosschecks.crosscheck_report(crosschecks.CrosscheckView(result))
     scenario = (result if isinstance(result, Prediction | Swept) else result.predictions[0]).scenario
     chosen = metric(of or scenario.metric or "trace", scenario.model)
     if isinstance(result, EstimatorComparison):

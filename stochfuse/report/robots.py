@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from stochfuse import __version__
 from stochfuse.data.robot_errors import Channel
 from stochfuse.data.robot_run import RobotRow, RobotRun
-from stochfuse.report.plot import COLORS, MARKERS, below, figure_class, titled
+from stochfuse.report.plot import COLORS, MARKERS, below, canvas, labelled, titled
 from stochfuse.report.runs import SCHEMA
-from stochfuse.report.table import Report, Table, number, to_csv
+from stochfuse.report.table import Report, Table, number, stamped, to_csv
 
 METRIC = "rms:x,y"
 POINTS = 400
@@ -22,12 +22,7 @@ CHANNELS = (("speed", "of speed"), ("turn", "of turn rate"), ("range", "of range
 
 def robot_report(found: RobotRun, digits: int = 3) -> Report:
     """Return a run of robots in every form."""
-    return Report(
-        lambda: _tables(found, digits),
-        lambda: _csv(found),
-        lambda: robot_json(found),
-        lambda: draw_robots(found),
-    )
+    return Report.of(found, partial(_tables, digits=digits), _csv, robot_json, draw_robots)
 
 
 def _titles(found: RobotRun) -> tuple[str, ...]:
@@ -84,8 +79,10 @@ def _noises(found: RobotRun) -> Table:
     return Table((title,), ("channel",), ("deviation", "robot", "subject", "factor", "constants"), tuple(rows))
 
 
-ERRORS = ("estimator", "agent", "link", "realised", "claimed", "predicted")
-HEADINGS = (*ERRORS, "nees", "nees_low", "nees_high", "verdict", "predicted_nees")
+HEADINGS = (
+    "estimator", "agent", "link", "realised", "claimed", "predicted", "nees", "nees_low", "nees_high", "verdict",
+    "predicted_nees",
+)  # fmt: skip
 
 
 def _values(row: RobotRow) -> tuple[Any, ...]:
@@ -95,7 +92,7 @@ def _values(row: RobotRow) -> tuple[Any, ...]:
 
 
 def _csv(found: RobotRun) -> str:
-    return to_csv(HEADINGS, [tuple("" if value is None else value for value in _values(row)) for row in found.rows])
+    return to_csv(HEADINGS, map(_values, found.rows))
 
 
 def robot_json(found: RobotRun) -> dict[str, Any]:
@@ -108,24 +105,22 @@ def robot_json(found: RobotRun) -> dict[str, Any]:
             for kind, p in (("common", c.common), ("subject", c.subject))
         }
         noises[name] = {"constant": c.mean.tolist(), "doubt": c.doubt.tolist(), "white": c.white.tolist(), **processes}
-    rows = [dict(zip(HEADINGS, _values(row), strict=True)) for row in found.rows]
-    return {
-        "schema": SCHEMA,
-        "version": __version__,
-        "metric": METRIC,
-        "runs": found.runs,
-        "steps": found.record.steps,
-        "arrivals": "drawn",
-        "rows": rows,
-        "noises": noises | {"turning_loss": found.noises.turning_loss, "gross": found.noises.gross},
-        "meta": {"description": list(_titles(found))},
-    }
+    return stamped(
+        SCHEMA,
+        metric=METRIC,
+        runs=found.runs,
+        steps=found.record.steps,
+        arrivals="drawn",
+        rows=[dict(zip(HEADINGS, _values(row), strict=True)) for row in found.rows],
+        noises=noises | {"turning_loss": found.noises.turning_loss, "gross": found.noises.gross},
+        meta={"description": list(_titles(found))},
+    )
 
 
 def draw_robots(found: RobotRun) -> Any:
     """Return the figure: errors over the link probability, and each robot alone with what was predicted of it."""
     robots = found.record.robots
-    figure = figure_class()(figsize=(10.5, 6.4), layout="constrained")
+    figure = canvas(10.5, 6.4)
     grid = figure.add_gridspec(len(robots), 2)
     left = figure.add_subplot(grid[:, 0])
     names = list(dict.fromkeys(row.estimator for row in found.rows))
@@ -135,11 +130,8 @@ def draw_robots(found: RobotRun) -> Any:
         style = {"color": COLORS[place % len(COLORS)], "marker": MARKERS[place % len(MARKERS)], "linewidth": 1.3}
         left.plot(link, [row.predicted for row in rows], dashes=(4, 2), markersize=4, markerfacecolor="w", **style)
         left.plot(link, [row.realised for row in rows], markersize=5, label=name, **style)
-    left.set_ylim(bottom=0)
-    left.set_xlabel("link probability µ")
-    left.set_ylabel("RMS of position [m]")
+    labelled(left, "link probability µ", "RMS of position [m]", zero=True)
     left.set_title("realised (filled), predicted (dashed)", fontsize="small")
-    left.grid(alpha=0.3)
     below(figure)
     shown = slice(None, None, max(1, found.record.steps // POINTS))
     seconds = np.arange(found.record.steps)[shown] * found.record.interval

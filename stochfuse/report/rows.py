@@ -17,9 +17,21 @@ from stochfuse.data.protocols import ProtocolLoad
 from stochfuse.prediction.result import Prediction
 from stochfuse.prediction.swept import Swept
 from stochfuse.questions.messages import Load, SweptLoad
+from stochfuse.report.plot import entry, shades, spread
+from stochfuse.report.table import counted
 from stochfuse.scenario.over import LINK, Over
 
 Cells = tuple[Any, ...]
+
+
+def whose(agent: int | str) -> str:
+    """Whose covariance it is, in words."""
+    texts = {
+        "mean": "covariance averaged over the agents",
+        "worst": "the agent with the largest value",
+        "best": "the agent with the smallest value",
+    }
+    return texts.get(str(agent), f"agent {agent}")
 
 
 @dataclass(frozen=True)
@@ -66,6 +78,18 @@ class ResultRows:
         if self.linked or (self.over is not None and any(key.name == LINK for key in self.over.keys)):
             return ""
         return f"; {self.mean} = {self.result.link[0]:.4g}"
+
+    @property
+    def sizes(self) -> list[int]:
+        """Numbers of agents, rising."""
+        return sorted({s.network.agents for s in (self.over.scenarios if self.over else (self.result.scenario,))})
+
+    @property
+    def agents(self) -> str:
+        """The scenario, and how many agents: `thesis-transient: 2 to 4 agents, ad-hoc`."""
+        scenario, numbers = self.result.scenario, self.sizes
+        several = f"{numbers[0]} to " if len(numbers) > 1 else ""
+        return f"{scenario.name}: {several}{counted(numbers[-1], 'agent')}, {scenario.network.architecture}"
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -209,6 +233,25 @@ class Curves(NamedTuple):
     what: str
     whole: bool = False
     at: str = ""
+
+    def shown(self) -> list[ShownCurve]:
+        """Return those that are drawn, at most eight from first to last."""
+        chosen = spread(len(self.names))
+        each = zip(chosen, shades(len(chosen)), strict=True)
+        return [ShownCurve(self.names[c], self.x[c], self.picks[c], color) for c, color in each]
+
+    def entries(self) -> list[Any]:
+        """Return what a legend says of their colours."""
+        return [entry(curve.name, color=curve.color, linewidth=3) for curve in self.shown()]
+
+
+class ShownCurve(NamedTuple):
+    """A curve that is drawn: its name, its x, the index of its values, and its colour."""
+
+    name: str
+    x: np.ndarray
+    pick: Any
+    color: Any
 
 
 def _by_step(x: np.ndarray, rows: np.ndarray, steps: np.ndarray | None, label: str, *, whole: bool = False) -> Curves:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from stochfuse import __version__
 from stochfuse.data.consistency import Average
 from stochfuse.data.run import Row, RunResult, Trace
-from stochfuse.report.plot import COLORS, DASHES, below, figure_class, titled
-from stochfuse.report.table import Report, Table, number, to_csv
+from stochfuse.report.plot import band, below, canvas, labelled, look, titled
+from stochfuse.report.table import Report, Table, counted, number, records_csv, stamped
 
 SCHEMA = "stochfuse.run/1"
 MOST_AGENTS = 6
@@ -19,16 +19,14 @@ MOST_AGENTS = 6
 
 def run_report(found: RunResult, digits: int = 5) -> Report:
     """Return a run in every form."""
-    return Report(
-        lambda: run_tables(found, digits), lambda: run_csv(found), lambda: run_json(found), lambda: draw(found)
-    )
+    return Report.of(found, partial(run_tables, digits=digits), run_csv, run_json, draw)
 
 
 def _titles(found: RunResult) -> tuple[str, ...]:
     network, metric = found.scenario.network, found.metric
     unit = f" [{metric.unit}]" if metric.unit else ""
-    arrivals = "arrivals drawn from the links" if found.drawn else "arrivals as recorded"
-    runs = f"{found.runs:,} run{'s' * (found.runs != 1)} of {network.steps:,} steps"
+    arrivals = "arrivals drawn from the links" if found.drawn or found.simulated else "arrivals as recorded"
+    runs = f"{counted(found.runs, 'run')} of {network.steps:,} steps"
     truth = any(row.realised is not None for row in found.rows)
     return (
         f"Estimators on data of {found.scenario.name}: {metric.label}{unit}; posterior, mean over steps",
@@ -94,61 +92,46 @@ def _average(average: Average) -> tuple[str, str, str]:
     return number(average.mean, 4), number(average.low, 4), number(average.high, 4)
 
 
-HEADINGS = ("estimator", "agent", "link", "realised", "claimed", "predicted", "given_arrivals", "method", "nees")
-MORE = ("nees_low", "nees_high", "nis", "nis_low", "nis_high", "verdict", "metric", "runs", "steps")
+def _record(row: Row) -> dict[str, Any]:
+    """What is known of an estimator and an agent, None for the mean over the agents and for what cannot be known."""
+    averages = {}
+    for name, average in (("nees", row.nees), ("nis", row.nis)):
+        ends = (None, None, None) if average is None else (average.mean, average.low, average.high)
+        averages |= dict(zip((name, f"{name}_low", f"{name}_high"), ends, strict=True))
+    return {
+        "estimator": row.estimator,
+        "agent": row.agent,
+        "link": row.link,
+        "realised": row.realised,
+        "claimed": row.claimed,
+        "predicted": row.predicted,
+        "given_arrivals": row.given,
+        "method": row.method or None,
+        **averages,
+        "verdict": row.verdict,
+    }
 
 
 def run_csv(found: RunResult) -> str:
     """One line for every estimator and agent; agent is empty for the mean over the agents."""
-    rows = []
-    for row in found.rows:
-        values = (row.estimator, row.agent, row.link, row.realised, row.claimed, row.predicted, row.given, row.method)
-        line = (*values, *_ends(row.nees), *_ends(row.nis), row.verdict, found.metric.name, found.runs)
-        rows.append(tuple("" if value is None else value for value in (*line, found.scenario.network.steps)))
-    return to_csv((*HEADINGS, *MORE), rows)
-
-
-def _ends(average: Average | None) -> tuple[float | None, float | None, float | None]:
-    return (None, None, None) if average is None else (average.mean, average.low, average.high)
+    of_run = {"metric": found.metric.name, "runs": found.runs, "steps": found.scenario.network.steps}
+    records = [_record(row) | of_run for row in found.rows]
+    return records_csv(tuple(records[0]), records)
 
 
 def run_json(found: RunResult) -> dict[str, Any]:
     """Return the object of schema stochfuse.run/1; what cannot be known is null."""
-    rows = []
-    for row in found.rows:
-        nees, nees_low, nees_high = _ends(row.nees)
-        nis, nis_low, nis_high = _ends(row.nis)
-        rows.append(
-            {
-                "estimator": row.estimator,
-                "agent": row.agent,
-                "link": row.link,
-                "realised": row.realised,
-                "claimed": row.claimed,
-                "predicted": row.predicted,
-                "given_arrivals": row.given,
-                "method": row.method or None,
-                "nees": nees,
-                "nees_low": nees_low,
-                "nees_high": nees_high,
-                "nis": nis,
-                "nis_low": nis_low,
-                "nis_high": nis_high,
-                "verdict": row.verdict,
-            }
-        )
-    return {
-        "schema": SCHEMA,
-        "version": __version__,
-        "metric": found.metric.name,
-        "runs": found.runs,
-        "steps": found.scenario.network.steps,
-        "arrivals": "drawn" if found.drawn else "recorded",
-        "rows": rows,
-        "suspicions": [each._asdict() for each in found.suspicions],
-        "scenario": found.scenario.to_mapping(),
-        "meta": {"description": list(_titles(found)), "notes": list(found.notes)},
-    }
+    return stamped(
+        SCHEMA,
+        metric=found.metric.name,
+        runs=found.runs,
+        steps=found.scenario.network.steps,
+        arrivals="drawn" if found.drawn else "recorded",
+        rows=list(map(_record, found.rows)),
+        suspicions=[each._asdict() for each in found.suspicions],
+        scenario=found.scenario.to_mapping(),
+        meta={"description": list(_titles(found)), "notes": list(found.notes)},
+    )
 
 
 def draw(found: RunResult) -> Any:
@@ -168,7 +151,7 @@ def draw(found: RunResult) -> Any:
     known = any(not np.isnan(trace.nees).all() for trace in found.traces)
     checked = known or any(not np.isnan(trace.nis).all() for trace in found.traces)
     heights = [3.0, 1.0] * rows + ([2.2] if checked else [])
-    figure = figure_class()(figsize=(4.2 * columns + 0.6, 0.95 * sum(heights) + 1.6), layout="constrained")
+    figure = canvas(4.2 * columns + 0.6, 0.95 * sum(heights) + 1.6)
     grid = figure.add_gridspec(len(heights), columns, height_ratios=heights)
     handles: list[Any] = []
     for place, agent in enumerate(agents):
@@ -198,15 +181,13 @@ def _errors(axes: Any, found: RunResult, agent: int) -> list[Any]:
             sigma = 2.0 * np.sqrt(trace.variance[:, agent, state])
             middle = np.zeros_like(sigma) if known else shown
             axes.fill_between(k, middle - sigma, middle + sigma, color="0.85", label="±2σ claimed", linewidth=0)
-        style = {"color": COLORS[place % len(COLORS)], "linestyle": DASHES[place % len(DASHES)]}
-        axes.plot(k, shown, linewidth=1.3, label=trace.estimator, **style)
+        axes.plot(k, shown, linewidth=1.3, label=trace.estimator, **look(place))
     unit = model.units[state]
     name = f"{'error of ' if known else ''}{model.states[state]}"
-    axes.set_ylabel(f"{name} [{unit}]" if unit else name)
+    labelled(axes, None, f"{name} [{unit}]" if unit else name)
     names = found.scenario.network.names
     axes.set_title(f"agent {names[agent] if names else agent + 1}", fontsize="small")
     axes.tick_params(labelbottom=False)
-    axes.grid(alpha=0.3)
     return axes.get_legend_handles_labels()[0]
 
 
@@ -236,16 +217,12 @@ def _averages(axes: Any, found: RunResult, name: str) -> None:
     """Averages of NEES or NIS over runs and agents, with what they keep if the agents of a run are one."""
     k = np.arange(1, found.scenario.network.steps + 1)
     each = [(trace.nees, trace.band) if name == "NEES" else (trace.nis, trace.nis_band) for trace in found.traces]
-    for place, (average, band) in enumerate(each):
-        style = {"color": COLORS[place % len(COLORS)], "linestyle": DASHES[place % len(DASHES)]}
+    for place, (average, kept) in enumerate(each):
         there = ~np.isnan(average)
-        axes.plot(k[there], average[there], linewidth=1.3, **style)
+        axes.plot(k[there], average[there], linewidth=1.3, **look(place))
         if place == 0:
-            axes.fill_between(k[there], *band[there].T, color="0.85", linewidth=0)
+            band(axes, k[there], kept[there, 0], kept[there, 1], "0.85", 1.0)
     if max(float(np.nanmax(average)) for average, _ in each) > 20.0 * float(np.nanmax(each[0][1])):
         axes.set_yscale("log")
-    axes.set_xlabel("step k")
-    axes.xaxis.get_major_locator().set_params(integer=True)
-    axes.set_ylabel(name)
-    axes.grid(alpha=0.3)
+    labelled(axes, "step k", name, whole=True)
     axes.set_title(f"{name}, mean over runs and agents (grey: where 95 % of consistent filters' lie)", fontsize="small")

@@ -11,21 +11,22 @@ from typing import Any
 
 import numpy as np
 
-from stochfuse import __version__
 from stochfuse.prediction.result import Prediction
 from stochfuse.questions.agents_needed import AgentsNeeded
 from stochfuse.questions.least_link import BESIDE, LeastLink
 from stochfuse.questions.least_value import LeastValue
 from stochfuse.questions.question import Question, described, named
 from stochfuse.questions.sensitivity import Sensitivity, ShareOfGain
-from stochfuse.report.plot import MARKERS, below, figure_class, spread, titled
+from stochfuse.report.plot import MARKERS, below, canvas, labelled, spread, titled
 from stochfuse.report.predictions import PredictionView
 from stochfuse.report.rows import ResultRows
-from stochfuse.report.table import Report, Table, number, to_csv
+from stochfuse.report.table import Report, Table, listed, number, stamped, to_csv
 
 SCHEMA = "stochfuse.solution/1"
 PRECISE = 12
 """Significant digits of link probabilities, and of values that differ by little."""
+RESULT, VALUE, LINKS, CASES = ("result",), ("value",), ("µ",), ("links", "mean µ")
+"""Headings: of a table with one answer, and of a row for each link or case."""
 PROOFS = {
     "monotone": "proved: the value never rises with the link probability",
     "polynomial": "proved: the value is a polynomial in µ, and every root was parted from the others",
@@ -92,25 +93,24 @@ def solution_csv(sheet: SolutionSheet) -> str:
 def solution_json(sheet: SolutionSheet) -> dict[str, Any]:
     """Return the object of schema stochfuse.solution/1."""
     p, asked = sheet.prediction, sheet.question
-    return {
-        "schema": SCHEMA,
-        "version": __version__,
-        "question": sheet.kind,
-        "method": p.method,
-        "quantity": p.quantity,
-        "metric": asked.metric.name,
-        "nature": p.nature,
-        "step": "steady" if asked.step is None else asked.step,
+    return stamped(
+        SCHEMA,
+        question=sheet.kind,
+        method=p.method,
+        quantity=p.quantity,
+        metric=asked.metric.name,
+        nature=p.nature,
+        step=_step(asked),
         **sheet.facts,
-        "scenario": asked.scenario.to_mapping(),
-        "meta": {
+        scenario=asked.scenario.to_mapping(),
+        meta={
             "description": list(sheet.titles),
             "stage": p.stage,
             "unit": sheet.view.unit or None,
             "agent": asked.agent,
             "notes": list(p.notes),
         },
-    }
+    )
 
 
 def least_link_sheet(found: LeastLink, digits: int = 5) -> SolutionSheet:
@@ -124,8 +124,7 @@ def least_link_sheet(found: LeastLink, digits: int = 5) -> SolutionSheet:
     else:
         answer = [f"Least link probability: µ = {number(µ, PRECISE)}, from which on {at_most}"]
     if found.met != ((µ, 1.0),):
-        spans = "; ".join(f"from {a:.9g} to {b:.9g}" for a, b in found.met)
-        answer = [answer[0].replace(", from which on", ", where"), f"It does not stay so: met for µ {spans} only"]
+        answer = [answer[0].replace(", from which on", ", where"), f"It does not stay so: met for µ {_met(found)} only"]
     certain = "certain within" if np.isfinite(found.bound) and found.proof != "scan" else "by rounding within"
     reason = PROOFS[found.proof] + (f"; {certain} {sure:.1g} in µ" if sure else "") + _bounded(found.bound)
     answer.append(reason[0].upper() + reason[1:])
@@ -138,7 +137,7 @@ def least_link_sheet(found: LeastLink, digits: int = 5) -> SolutionSheet:
         *((f"value at µ = {end}", number(v, digits)) for end, v in enumerate(found.reachable)),
         ("share of the gain", "none" if found.share is None else f"{100 * found.share:.4g} %"),
     ]
-    zero, one = (v if np.isfinite(v) else None for v in found.reachable)
+    zero, one = listed(found.reachable)
     facts = {
         "target": found.target,
         "link": µ,
@@ -149,25 +148,15 @@ def least_link_sheet(found: LeastLink, digits: int = 5) -> SolutionSheet:
         "certificate": {
             "proof": found.proof,
             "enclosure": list(found.enclosure),
-            "below": {"link": max(µ - BESIDE, 0.0), "value": found.below if np.isfinite(found.below) else None},
+            "below": {"link": max(µ - BESIDE, 0.0), "value": listed(found.below)},
             "above": {"link": min(µ + BESIDE, 1.0), "value": found.above},
-            "relative_bound": found.bound if np.isfinite(found.bound) else None,
+            "relative_bound": listed(found.bound),
         },
     }
     headings = ("step", "target", "link", "link_low", "link_high", "value", "value_at_0", "value_at_1", "share_of_gain")
-    record = (_step(asked), found.target, µ, low, high, found.value, _blank(zero), _blank(one), _blank(found.share))
-    return SolutionSheet(
-        "least-link",
-        asked,
-        found.prediction,
-        tuple(answer),
-        ("result",),
-        ("value",),
-        tuple(rows),
-        headings,
-        (record,),
-        facts,
-    )
+    record = (_step(asked), found.target, µ, low, high, found.value, zero, one, found.share)
+    table = (RESULT, VALUE, tuple(rows))
+    return SolutionSheet("least-link", asked, found.prediction, tuple(answer), *table, headings, (record,), facts)
 
 
 VALUE_PROOFS = {
@@ -187,15 +176,14 @@ def value_sheet(found: LeastValue, digits: int = 5) -> SolutionSheet:
     which = "at and above which" if found.direction == "least" else "at and below which"
     lines = [f"{found.direction.capitalize()} {found.key}: {at}, {which if single else 'where'} {at_most}"]
     if not single:
-        spans = "; ".join(f"from {a:.9g} to {b:.9g}" for a, b in found.met)
-        lines.append(f"Met for {found.key} {spans}")
+        lines.append(f"Met for {found.key} {_met(found)}")
     proof = VALUE_PROOFS[found.proof].format(n=found.grid.shape[1])
     if found.beside is None:
         proof += "; no value of the range misses the target on that side"
     else:
         proof += f"; certified: {found.beside[0]:.17g} misses the target, {found.at:.17g} meets it"
     lines.append(proof[0].upper() + proof[1:])
-    ends = [v if np.isfinite(v) else None for v in found.grid[1, [0, -1]].tolist()]
+    ends = listed(found.grid[1, [0, -1]])
     rows = [
         (f"{found.direction} {found.key}", at),
         ("target", f"{found.target:.{PRECISE}g}"),
@@ -206,7 +194,8 @@ def value_sheet(found: LeastValue, digits: int = 5) -> SolutionSheet:
             for end, v in zip((low, high), ends, strict=True)
         ),
     ]
-    beside = None if found.beside is None else {"over": found.beside[0], "value": _finite_or_none(found.beside[1])}
+    missed = None if found.beside is None else found.beside[0]
+    beside = None if found.beside is None else {"over": missed, "value": listed(found.beside[1])}
     facts = {
         "target": found.target,
         "link": float(found.prediction.link[0]),
@@ -221,22 +210,21 @@ def value_sheet(found: LeastValue, digits: int = 5) -> SolutionSheet:
         "between": [low, high],
         "met": [list(span) for span in found.met],
         "certificate": {"meets": {"over": found.at, "value": found.value}, "misses": beside},
-        "grid": [{"over": v, "value": _finite_or_none(e)} for v, e in found.grid.T.tolist()],
+        "grid": [{"over": v, "value": listed(e)} for v, e in found.grid.T.tolist()],
     }
-    title = f"{found.key} [{found.unit}]" if found.unit else found.key
-    headings = ("step", "target", "link", title, "direction", "proof", "value", "misses_at")
-    record = (
-        *(_step(asked), found.target, float(found.prediction.link[0]), found.at),
-        *(found.direction, found.proof, found.value, _blank(None if found.beside is None else found.beside[0])),
-    )
-    return SolutionSheet(
-        "least-value", asked, found.prediction, tuple(lines), ("result",), ("value",), tuple(rows), headings,
-        (record,), facts,
-    )  # fmt: skip
+    headings = ("step", "target", "link", _key(found), "direction", "proof", "value", "misses_at")
+    where = (_step(asked), found.target, float(found.prediction.link[0]), found.at)
+    record = (*where, found.direction, found.proof, found.value, missed)
+    table = (RESULT, VALUE, tuple(rows))
+    return SolutionSheet("least-value", asked, found.prediction, tuple(lines), *table, headings, (record,), facts)
 
 
-def _finite_or_none(value: float) -> float | None:
-    return value if np.isfinite(value) else None
+def _met(found: LeastLink | LeastValue) -> str:
+    return "; ".join(f"from {a:.9g} to {b:.9g}" for a, b in found.met)
+
+
+def _key(found: LeastValue) -> str:
+    return f"{found.key} [{found.unit}]" if found.unit else found.key
 
 
 def agents_sheet(found: AgentsNeeded, digits: int = 5) -> SolutionSheet:
@@ -257,14 +245,12 @@ def agents_sheet(found: AgentsNeeded, digits: int = 5) -> SolutionSheet:
         "value": found.value,
         "value_with_one_fewer": found.fewer,
         "tried": [{"agents": int(k), "value": float(v)} for k, v in found.tried.T],
-        "relative_bound": found.bound if np.isfinite(found.bound) else None,
+        "relative_bound": listed(found.bound),
     }
     headings = ("step", "target", "link", "agents", "value", "value_with_one_fewer")
-    record = (_step(asked), found.target, found.link, n, found.value, _blank(found.fewer))
-    columns = ("value", f"target {found.target:.9g}")
-    return SolutionSheet(
-        "agents-needed", asked, found.prediction, answer, ("agents",), columns, rows, headings, (record,), facts
-    )
+    record = (_step(asked), found.target, found.link, n, found.value, found.fewer)
+    table = (("agents",), ("value", f"target {found.target:.9g}"), rows)
+    return SolutionSheet("agents-needed", asked, found.prediction, answer, *table, headings, (record,), facts)
 
 
 IMPROVEMENT = 0.01
@@ -281,12 +267,9 @@ def sensitivity_sheet(found: Sensitivity, digits: int = 5) -> SolutionSheet:
     for rank, i in enumerate(found.order, start=1):
         sender, to = found.links[i][0], receivers(found, int(i))
         gain = -IMPROVEMENT * found.derivative[i]
-        rows.append(
-            (str(sender), to, f"{found.link[i]:.6g}", number(float(found.derivative[i]), digits), f"{-gain:+.3g}")
-        )
-        records.append(
-            (_step(asked), rank, sender, to, found.link[i], found.derivative[i], found.error[i], found.value)
-        )
+        slope, µ = found.derivative[i], found.link[i]
+        rows.append((str(sender), to, f"{µ:.6g}", number(float(slope), digits), f"{-gain:+.3g}"))
+        records.append((_step(asked), rank, sender, to, µ, slope, found.error[i], found.value))
     facts = {
         "value": found.value,
         "derivatives": "exact" if found.exact else "numerical",
@@ -301,20 +284,9 @@ def sensitivity_sheet(found: Sensitivity, digits: int = 5) -> SolutionSheet:
             for i in found.order
         ],
     }
-    columns = ("µ", "d value / dµ", f"µ + {IMPROVEMENT:g}")
+    table = (("from", "to"), ("µ", "d value / dµ", f"µ + {IMPROVEMENT:g}"), tuple(rows))
     headings = ("step", "rank", "sender", "receiver", "link", "derivative", "estimated_error", "value")
-    return SolutionSheet(
-        "sensitivity",
-        asked,
-        found.prediction,
-        answer,
-        ("from", "to"),
-        columns,
-        tuple(rows),
-        headings,
-        tuple(records),
-        facts,
-    )
+    return SolutionSheet("sensitivity", asked, found.prediction, answer, *table, headings, tuple(records), facts)
 
 
 def receivers(found: Sensitivity, i: int) -> str:
@@ -365,19 +337,17 @@ def gain_sheet(found: ShareOfGain, digits: int = 5) -> SolutionSheet:
         shares = [number(100 * s, digits) if np.isfinite(s) else "none" for s in found.share[i]]
         rows.append((*name, f"{µ:.6g}", *shares))
         for c, k in enumerate(steps):
-            share = found.share[i, c]
-            records.append((*(name or ("",)), µ, k, share if np.isfinite(share) else "", found.value[i, c]))
+            records.append((*(name or ("",)), µ, k, listed(found.share[i, c]), found.value[i, c]))
     facts = {
-        "link": p.link.tolist(),
-        **({} if p.cases is None else {"cases": list(p.cases)}),
+        **ResultRows(p).facts,
         "steps": steps,
-        "share_of_gain": [[float(s) if np.isfinite(s) else None for s in row] for row in found.share],
+        "share_of_gain": listed(found.share),
         "values": found.value.tolist(),
         "reachable": {"at_0": found.reachable[0].tolist(), "at_1": found.reachable[1].tolist()},
     }
-    keys = ("µ",) if p.cases is None else ("links", "mean µ")
     headings = ("case", "link", "step", "share_of_gain", "value")
-    return SolutionSheet("gain", asked, p, tuple(answer), keys, columns, tuple(rows), headings, tuple(records), facts)
+    table = (LINKS if p.cases is None else CASES, columns, tuple(rows))
+    return SolutionSheet("gain", asked, p, tuple(answer), *table, headings, tuple(records), facts)
 
 
 def steady_sheet(asked: Question, prediction: Prediction, digits: int = 5) -> SolutionSheet:
@@ -388,20 +358,27 @@ def steady_sheet(asked: Question, prediction: Prediction, digits: int = 5) -> So
     rows, records = [], []
     for i, µ in enumerate(p.link):
         name = () if p.cases is None else (p.cases[i],)
-        proved = bool(np.isfinite(bounds[i]))
-        rows.append((*name, f"{µ:.6g}", number(values[i], digits), f"{bounds[i]:.0e}" if proved else "not proved"))
-        records.append((*(name or ("",)), µ, "steady", values[i], bounds[i] if proved else ""))
-    facts = {
-        "link": p.link.tolist(),
-        **({} if p.cases is None else {"cases": list(p.cases)}),
-        "values": values.tolist(),
-        "relative_bound": [float(b) if np.isfinite(b) else None for b in bounds],
-    }
-    keys = ("µ",) if p.cases is None else ("links", "mean µ")
+        bound = "not proved" if np.isinf(bounds[i]) else f"{bounds[i]:.0e}"
+        rows.append((*name, f"{µ:.6g}", number(values[i], digits), bound))
+        records.append((*(name or ("",)), µ, "steady", values[i], listed(bounds[i])))
+    facts = {**ResultRows(p).facts, "values": values.tolist(), "relative_bound": listed(bounds)}
     headings = ("case", "link", "step", "value", "relative_bound")
-    return SolutionSheet(
-        "steady", asked, p, answer, keys, ("steady", "bound"), tuple(rows), headings, tuple(records), facts
-    )
+    table = (LINKS if p.cases is None else CASES, ("steady", "bound"), tuple(rows))
+    return SolutionSheet("steady", asked, p, answer, *table, headings, tuple(records), facts)
+
+
+SHEETS: dict[type, Callable[..., SolutionSheet]] = {
+    LeastLink: least_link_sheet,
+    LeastValue: value_sheet,
+    AgentsNeeded: agents_sheet,
+    Sensitivity: sensitivity_sheet,
+    ShareOfGain: gain_sheet,
+}
+
+
+def sheet_of(found: Any, digits: int = 5) -> SolutionSheet:
+    """Return the sheet of an answer; a steady state has `steady_sheet`."""
+    return SHEETS[type(found)](found, digits)
 
 
 def _bounded(bound: float) -> str:
@@ -414,26 +391,14 @@ def _step(asked: Question) -> int | str:
     return "steady" if asked.step is None else asked.step
 
 
-def _blank(value: float | None) -> float | str:
-    return "" if value is None else value
-
-
 MOST_BARS = 12
 
 
 def draw(sheet: SolutionSheet, found: Any) -> Any:
     """Return the figure of an answer under what it means."""
-    figure = figure_class()(figsize=(7.5, 5.4), layout="constrained")
+    figure = canvas(7.5, 5.4)
     axes = figure.add_subplot()
-    drawn: dict[str, Callable[..., None]] = {
-        "least-link": _draw_least_link,
-        "least-value": _draw_value,
-        "agents-needed": _draw_agents,
-        "sensitivity": _draw_sensitivity,
-        "gain": _draw_gain,
-        "steady": _draw_steady,
-    }
-    drawn[sheet.kind](axes, sheet, found)
+    DRAWN[sheet.kind](axes, sheet, found)
     below(figure)
     titled(figure, sheet.answer[0], *sheet.titles[len(sheet.answer) :])
     return figure
@@ -444,26 +409,25 @@ def _label(sheet: SolutionSheet) -> str:
     return f"{named(sheet.question).partition(' (')[0]}{unit}"
 
 
-def _draw_least_link(axes: Any, sheet: SolutionSheet, found: LeastLink) -> None:
-    µ, values = found.curve()
-    axes.plot(µ, values, color="C0", label=f"value, {sheet.question.when}")
+def _draw_met(axes: Any, found: LeastLink | LeastValue, at: float, name: str) -> None:
+    """Draw the target, where it is met, and the answer."""
     axes.axhline(found.target, color="C3", linestyle="--", linewidth=1, label=f"target {found.target:.6g}")
     for i, (a, b) in enumerate(found.met):
         axes.axvspan(a, b, color="C2", alpha=0.12, linewidth=0, label="met" if i == 0 else None)
-    axes.plot([found.link], [found.value], "o", color="C3", label=f"least µ = {found.link:.6g}")
-    axes.axvline(found.link, color="C3", linestyle=":", linewidth=1)
-    _finish(axes, "link probability µ", _label(sheet))
+    axes.plot([at], [found.value], "o", color="C3", label=f"{name} {at:.6g}")
+    axes.axvline(at, color="C3", linestyle=":", linewidth=1)
+
+
+def _draw_least_link(axes: Any, sheet: SolutionSheet, found: LeastLink) -> None:
+    axes.plot(*found.curve(), color="C0", label=f"value, {sheet.question.when}")
+    _draw_met(axes, found, found.link, "least µ =")
+    labelled(axes, "link probability µ", _label(sheet))
 
 
 def _draw_value(axes: Any, sheet: SolutionSheet, found: LeastValue) -> None:
     axes.plot(*found.grid, ".-", color="C0", markersize=3, label=f"value, {sheet.question.when}")
-    axes.axhline(found.target, color="C3", linestyle="--", linewidth=1, label=f"target {found.target:.6g}")
-    for i, (a, b) in enumerate(found.met):
-        axes.axvspan(a, b, color="C2", alpha=0.12, linewidth=0, label="met" if i == 0 else None)
-    unit = f" [{found.unit}]" if found.unit else ""
-    axes.plot([found.at], [found.value], "o", color="C3", label=f"{found.direction}: {found.at:.6g}")
-    axes.axvline(found.at, color="C3", linestyle=":", linewidth=1)
-    _finish(axes, f"{found.key}{unit}", _label(sheet))
+    _draw_met(axes, found, found.at, f"{found.direction}:")
+    labelled(axes, _key(found), _label(sheet))
 
 
 def _draw_agents(axes: Any, sheet: SolutionSheet, found: AgentsNeeded) -> None:
@@ -473,7 +437,7 @@ def _draw_agents(axes: Any, sheet: SolutionSheet, found: AgentsNeeded) -> None:
     if found.tried[0].max() > 30:
         axes.set_xscale("log")
         axes.set_yscale("log")
-    _finish(axes, "agents", _label(sheet))
+    labelled(axes, "agents", _label(sheet))
 
 
 def _draw_sensitivity(axes: Any, sheet: SolutionSheet, found: Sensitivity) -> None:
@@ -484,7 +448,7 @@ def _draw_sensitivity(axes: Any, sheet: SolutionSheet, found: Sensitivity) -> No
         first = ["//" if int(i) in found.first else "" for i in order]
         axes.barh(names, found.derivative[order], color=["C3" if f else "C0" for f in first], hatch=first)
         axes.axvline(0, color="0.3", linewidth=0.8)
-        _finish(axes, label + "; hatched: improve first", "link")
+        labelled(axes, label + "; hatched: improve first", "link")
         return
     n = found.question.scenario.network.agents
     grid = np.full((n, n), np.nan)
@@ -506,11 +470,11 @@ def _draw_gain(axes: Any, sheet: SolutionSheet, found: ShareOfGain) -> None:
         for i, c in enumerate(spread(len(names))):
             axes.plot(p.link[order], 100 * found.share[order, c], marker=MARKERS[i], markersize=4, label=names[c])
         axes.plot([0, 1], [0, 100], color="0.6", linewidth=0.8, linestyle=":")
-        _finish(axes, "link probability µ", "share of the gain [%]")
+        labelled(axes, "link probability µ", "share of the gain [%]")
     else:
         for i, row in enumerate(spread(len(p.cases))):
             axes.plot(names, 100 * found.share[row], marker=MARKERS[i], markersize=4, label=p.cases[row])
-        _finish(axes, "step", "share of the gain [%]")
+        labelled(axes, "step", "share of the gain [%]")
 
 
 def _draw_steady(axes: Any, sheet: SolutionSheet, found: Any) -> None:
@@ -518,14 +482,18 @@ def _draw_steady(axes: Any, sheet: SolutionSheet, found: Any) -> None:
     if p.cases is None:
         order = np.argsort(p.link)
         axes.plot(p.link[order], values[order], "o-", color="C0", markersize=4)
-        _finish(axes, "link probability µ", f"{_label(sheet)}, steady state")
+        labelled(axes, "link probability µ", f"{_label(sheet)}, steady state")
     else:
         axes.bar(p.cases, values, color="C0")
-        _finish(axes, "links", f"{_label(sheet)}, steady state")
+        labelled(axes, "links", f"{_label(sheet)}, steady state")
     axes.set_ylim(bottom=0)
 
 
-def _finish(axes: Any, x: str, y: str) -> None:
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
-    axes.grid(alpha=0.3)
+DRAWN: dict[str, Callable[..., None]] = {
+    "least-link": _draw_least_link,
+    "least-value": _draw_value,
+    "agents-needed": _draw_agents,
+    "sensitivity": _draw_sensitivity,
+    "gain": _draw_gain,
+    "steady": _draw_steady,
+}

@@ -7,10 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse import __version__
 from stochfuse.prediction.expected_states import ExpectedStates
-from stochfuse.report.plot import COLORS, DASHES, below, figure_class, spread, titled
-from stochfuse.report.table import Report, Table, number, to_csv
+from stochfuse.report.plot import band, below, canvas, labelled, look, spread, titled
+from stochfuse.report.table import Report, Table, number, stamped, to_csv
 from stochfuse.scenario import registry
 
 SCHEMA = "stochfuse.prediction/1"
@@ -87,8 +86,8 @@ def states_csv(view: StatesView) -> str:
     model = found.scenario.model
     for index in np.ndindex(found.x.shape):
         row, k, agent, state = index
-        deviation = "" if found.deviation is None else found.deviation[index]
-        error = "" if found.standard_error is None else found.standard_error[index]
+        deviation = None if found.deviation is None else found.deviation[index]
+        error = None if found.standard_error is None else found.standard_error[index]
         where = (_label(found, row), k + 1, agent + 1, model.states[state], model.units[state])
         rows.append((*where, found.x[index], deviation, error, found.method, found.estimator, found.nature))
     headings = ("link", "step", "agent", "state", "unit", "expected", "spread", "standard_error")
@@ -101,33 +100,32 @@ def states_json(view: StatesView) -> dict[str, Any]:
     A number in the place of the list where there is one state.
     """
     found = view.found
-    error = None if found.standard_error is None else _listed(found.standard_error)
-    return {
-        "schema": SCHEMA,
-        "version": __version__,
-        "method": found.method,
-        "estimator": found.estimator,
-        "quantity": "state",
-        "metric": None,
-        "agent": view.agent,
-        "states": list(found.scenario.model.states),
-        "link": found.link.tolist(),
-        "cases": None if found.cases is None else list(found.cases),
-        "steps": found.steps.tolist(),
-        "values": _listed(view.of(found.x)),
-        "spread": None if view.deviation is None else _listed(view.deviation),
-        "agents": {
-            "values": _listed(found.x),
-            "spread": None if found.deviation is None else _listed(found.deviation),
-            "standard_error": error,
+    return stamped(
+        SCHEMA,
+        method=found.method,
+        estimator=found.estimator,
+        quantity="state",
+        metric=None,
+        agent=view.agent,
+        states=list(found.scenario.model.states),
+        link=found.link.tolist(),
+        cases=None if found.cases is None else list(found.cases),
+        steps=found.steps.tolist(),
+        values=_squeezed(view.of(found.x)),
+        spread=_squeezed(view.deviation),
+        agents={
+            "values": _squeezed(found.x),
+            "spread": _squeezed(found.deviation),
+            "standard_error": _squeezed(found.standard_error),
         },
-        "scenario": found.scenario.to_mapping(),
-        "meta": {"description": list(view.titles), "nature": found.nature},
-    }
+        scenario=found.scenario.to_mapping(),
+        meta={"description": list(view.titles), "nature": found.nature},
+    )
 
 
-def _listed(values: np.ndarray) -> Any:
-    return (values[..., 0] if values.shape[-1] == 1 else values).tolist()
+def _squeezed(values: np.ndarray | None) -> Any:
+    """Lists of numbers in the place of lists of one state; None of None."""
+    return None if values is None else (values[..., 0] if values.shape[-1] == 1 else values).tolist()
 
 
 def draw(view: StatesView) -> Any:
@@ -135,21 +133,19 @@ def draw(view: StatesView) -> Any:
     found, x, deviation = view.found, view.of(view.found.x), view.deviation
     model = found.scenario.model
     d = len(model.states)
-    figure = figure_class()(figsize=(8.0, 1.6 + 2.6 * d), layout="constrained")
+    figure = canvas(8.0, 1.6 + 2.6 * d)
     rows = spread(len(found.link))
     panels = figure.subplots(d, 1, sharex=True, squeeze=False)[:, 0]
     for state, axes in enumerate(panels):
         for place, row in enumerate(rows):
-            style = {"color": COLORS[place % len(COLORS)], "linestyle": DASHES[place % len(DASHES)]}
+            middle, style = x[row, :, state], look(place)
             label = f"µ = {_label(found, row)}" if state == 0 else None
-            axes.plot(found.steps, x[row, :, state], label=label, linewidth=1.4, **style)
+            axes.plot(found.steps, middle, label=label, linewidth=1.4, **style)
             if deviation is not None:
-                ends = (x[row, :, state] + sign * deviation[row, :, state] for sign in (-1.0, 1.0))
-                axes.fill_between(found.steps, *ends, color=style["color"], alpha=0.15, linewidth=0)
+                reach = deviation[row, :, state]
+                band(axes, found.steps, middle - reach, middle + reach, style["color"])
         unit = model.units[state]
-        axes.set_ylabel(f"{model.states[state]} [{unit}]" if unit else model.states[state])
-        axes.grid(alpha=0.3)
-        axes.xaxis.get_major_locator().set_params(integer=True)
+        labelled(axes, None, f"{model.states[state]} [{unit}]" if unit else model.states[state], whole=True)
     panels[-1].set_xlabel("step k")
     below(figure)
     titled(figure, *view.titles)

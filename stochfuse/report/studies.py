@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from stochfuse import __version__
-from stochfuse.report.predictions import counted
-from stochfuse.report.table import Table, number, to_csv
+from stochfuse.report.rows import whose
+from stochfuse.report.table import Table, counted, listed, number, records_csv, stamped
 from stochfuse.scenario.registry import OPTIMAL
 from stochfuse.studies.pareto import ParetoFront
 from stochfuse.studies.plan import ERROR, NODES, Plan
@@ -39,16 +38,6 @@ def design(plan: Plan) -> str:
     kinds = {"grid": "grid", "list": "list", "latin-hypercube": "Latin hypercube"}
     several = [f"{axis.name} ({'range' if axis.values is None else len(axis.values)})" for axis in plan.axes]
     return f"{kinds[plan.kind]} of {counted(plan.size, 'point')} over {', '.join(several)}"
-
-
-def whose(plan: Plan) -> str:
-    """Whose covariance it is, in words."""
-    texts = {
-        "mean": "covariance averaged over the agents",
-        "worst": "the agent with the largest value",
-        "best": "the agent with the smallest value",
-    }
-    return texts.get(str(plan.agent), f"agent {plan.agent}")
 
 
 def spoken(plan: Plan, column: str) -> str:
@@ -203,7 +192,7 @@ def titles(results: Results, summary: Summary) -> tuple[str, ...]:
     more = results.failed - len(results.first_errors)
     return (
         f"Study {plan.name}: {design(plan)}",
-        f"Scenario {plan.scenario_name}; {whose(plan)}",
+        f"Scenario {plan.scenario_name}; {whose(plan.agent)}",
         f"{results.path.name}: {counted(results.rows, 'row')}, {failures(results.failed)}",
         *(f"failed: {points}: {reason}" for points, reason in _together(results.first_errors)),
         *([f"failed: {counted(more, 'point')} more"] if more else []),
@@ -235,11 +224,7 @@ def summary_csv(results: Results) -> str:
     ]
     keys = [axis.name for axis in plan.axes]
     told = ("column", "label", "extreme", "value", "point", "step")
-    return _csv((*of_study, *told, *keys, *(name for name in HOW if name not in keys)), records)
-
-
-def _csv(headings: Sequence[str], records: Iterable[Mapping[str, Any]]) -> str:
-    return to_csv(headings, [[record[name] for name in headings] for record in records])
+    return records_csv((*of_study, *told, *keys, *(name for name in HOW if name not in keys)), records)
 
 
 def summary_json(results: Results) -> dict[str, Any]:
@@ -249,25 +234,24 @@ def summary_json(results: Results) -> dict[str, Any]:
     for e in summary.extremes:
         keys = {key: json_of(value) for key, value in e.keys.items()}
         columns[e.column][e.extreme] = {"value": e.value, "point": e.point, "step": e.step, "keys": keys, **e.how}
-    return {
-        "schema": SCHEMA,
-        "version": __version__,
+    return stamped(
+        SCHEMA,
         **study_json(plan),
-        "file": str(results.path),
-        "points": plan.size,
-        "rows": results.rows,
-        "failed": results.failed,
-        "first_errors": [{"point": point, "reason": reason} for point, reason in results.first_errors],
-        "natures": dict(summary.natures),
-        "columns": columns,
-        "meta": {"description": list(titles(results, summary))},
-    }
+        file=str(results.path),
+        points=plan.size,
+        rows=results.rows,
+        failed=results.failed,
+        first_errors=[{"point": point, "reason": reason} for point, reason in results.first_errors],
+        natures=dict(summary.natures),
+        columns=columns,
+        meta={"description": list(titles(results, summary))},
+    )
 
 
 def _front(found: ParetoFront) -> Iterator[dict[str, Any]]:
     """A record for each point of the front, by rising load: its costs, its keys, and how it was predicted."""
     for i, point in enumerate(found.points.tolist()):
-        error = None if found.error is None or not np.isfinite(found.error[i]) else float(found.error[i])
+        error = None if found.error is None else listed(found.error[i])
         yield {
             "point": point,
             "step": int(found.steps[i]),
@@ -288,7 +272,7 @@ def pareto_titles(found: ParetoFront, results: Results) -> tuple[str, ...]:
     fixed = "".join(f", {name} = {shortened(value)}" for name, value in _fixed(found, plan).items())
     return (
         f"Study {plan.name}: accuracy against message load; no point does better in both than {these}",
-        f"Scenario {plan.scenario_name}; {whose(plan)}; {counted(found.compared, 'point')} compared{fixed}, "
+        f"Scenario {plan.scenario_name}; {whose(plan.agent)}; {counted(found.compared, 'point')} compared{fixed}, "
         f"{failures(results.failed)}",
         f"load: {load_label(plan)}",
         f"accuracy: {spoken(plan, found.column)}, after {when}; {natures}"
@@ -322,7 +306,7 @@ def pareto_csv(found: ParetoFront, results: Results) -> str:
     of_study = {"study": results.plan.name, "column": found.column, "label": spoken(results.plan, found.column)}
     how = [name for name in HOW if name not in found.keys]
     told = ("study", "point", "step", "load", "column", "label", "accuracy", "standard_error")
-    return _csv((*told, *found.keys, *how), ({**of_study, **point, **point["keys"]} for point in _front(found)))
+    return records_csv((*told, *found.keys, *how), ({**of_study, **point, **point["keys"]} for point in _front(found)))
 
 
 def pareto_json(found: ParetoFront, results: Results) -> dict[str, Any]:
@@ -331,17 +315,16 @@ def pareto_json(found: ParetoFront, results: Results) -> dict[str, Any]:
     for point in _front(found):
         point["keys"] = {key: json_of(value) for key, value in point["keys"].items()}
         points.append({name: value for name, value in point.items() if value is not None})
-    return {
-        "schema": PARETO_SCHEMA,
-        "version": __version__,
+    return stamped(
+        PARETO_SCHEMA,
         **study_json(results.plan),
-        "column": found.column,
-        "accuracy": spoken(results.plan, found.column),
-        "load": load_label(results.plan),
-        "step": found.step,
-        "where": {name: json_of(value) for name, value in found.fixed.items()},
-        "compared": found.compared,
-        "failed": results.failed,
-        "front": points,
-        "meta": {"description": list(pareto_titles(found, results)), "notes": list(found.notes)},
-    }
+        column=found.column,
+        accuracy=spoken(results.plan, found.column),
+        load=load_label(results.plan),
+        step=found.step,
+        where={name: json_of(value) for name, value in found.fixed.items()},
+        compared=found.compared,
+        failed=results.failed,
+        front=points,
+        meta={"description": list(pareto_titles(found, results)), "notes": list(found.notes)},
+    )

@@ -16,9 +16,9 @@ import numpy as np
 
 from stochfuse.errors import UsageError
 from stochfuse.report import studies
-from stochfuse.report.plot import COLORS, DASHES, MARKERS, figure_class, spread
-from stochfuse.report.predictions import counted
-from stochfuse.report.studies import LONGEST, load_label, shortened, spoken, whose, words_of
+from stochfuse.report.plot import COLORS, DASHES, MARKERS, canvas, labelled, spread
+from stochfuse.report.rows import whose
+from stochfuse.report.studies import LONGEST, load_label, shortened, spoken, words_of
 from stochfuse.report.study_slices import (
     MARKED,
     MOST_DRAWN,
@@ -31,7 +31,7 @@ from stochfuse.report.study_slices import (
     sliced,
     thinned,
 )
-from stochfuse.report.table import Report, number
+from stochfuse.report.table import Report, counted, number
 from stochfuse.studies.pareto import ParetoFront
 from stochfuse.studies.plan import NODES, Axis, Plan
 
@@ -79,13 +79,8 @@ def summary_report(results: Results, digits: int, drawn: tuple[Any, ...] = ()) -
     ----------
     drawn : keys, column, kind, fixed values and step of the figure, see `draw`.
     """
-    table = partial(studies.summary_table, results, digits)
-    return Report(
-        table,
-        partial(studies.summary_csv, results),
-        partial(studies.summary_json, results),
-        partial(draw, results, *drawn),
-    )
+    table = partial(studies.summary_table, digits=digits)
+    return Report.of(results, table, studies.summary_csv, studies.summary_json, lambda _: draw(results, *drawn))
 
 
 def pareto_report(found: ParetoFront, results: Results, digits: int) -> Report:
@@ -129,7 +124,7 @@ def draw(
     shown = sliced(results, keys, column, where, step)
     if kind == "contour":
         _check_contours(shown)
-    figure = figure_class()(figsize=SIZE, layout="constrained")
+    figure = canvas(*SIZE)
     axes = figure.add_subplot()
     # scales first: labels of contours are placed on them
     for which, axis in zip("xy", shown.over, strict=False):
@@ -204,12 +199,10 @@ def _lines(axes: Any, shown: Slice) -> None:
 
 
 def _value_axis(axes: Any, shown: Slice) -> None:
-    axes.set_ylabel(wrapped(spoken(shown.plan, shown.column), 50))
-    axes.grid(alpha=0.3)
     if wide(shown.values):
         axes.set_yscale("log")
-    elif shown.values.min() >= 0:
-        axes.set_ylim(bottom=0)
+    zero = not wide(shown.values) and shown.values.min() >= 0
+    labelled(axes, None, wrapped(spoken(shown.plan, shown.column), 50), zero=zero)
 
 
 def _about(shown: Slice) -> list[str]:
@@ -232,7 +225,7 @@ def _not_drawn(failed: int) -> str:
 def _entitle(axes: Any, title: str, plan: Plan, lines: Sequence[str]) -> None:
     """Write the title, and under it which study it is and the lines that are not empty."""
     axes.figure.suptitle(wrapped(title[0].upper() + title[1:], 80), fontsize="medium")
-    whole = [f"Study {plan.name}, scenario {plan.scenario_name}; {whose(plan)}", *filter(None, lines)]
+    whole = [f"Study {plan.name}, scenario {plan.scenario_name}; {whose(plan.agent)}", *filter(None, lines)]
     axes.set_title("\n".join(wrapped(line, 95) for line in whole), fontsize=SMALL)
 
 
@@ -456,7 +449,7 @@ def draw_triangles(axes: Any, shown: Slice, x: np.ndarray, y: np.ndarray) -> Non
 
 def draw_pareto(found: ParetoFront, results: Results) -> Any:
     """Draw all points, and the front as a line of steps: the best accuracy at no more than so much load."""
-    figure = figure_class()(figsize=SIZE, layout="constrained")
+    figure = canvas(*SIZE)
     axes = figure.add_subplot()
     one_in = -(-found.compared // MOST_DRAWN)
     load, accuracy = _all(found, results, one_in)
@@ -469,16 +462,14 @@ def draw_pareto(found: ParetoFront, results: Results) -> Any:
     style = {"color": "black", "linewidth": 1, "drawstyle": "steps-post", "zorder": 2}
     axes.plot(found.load, found.accuracy, label="front, with numbers of points", **style)
     _mark_front(axes, found, results.plan)
-    axes.set_xlabel(wrapped(load_label(results.plan), 80))
-    axes.set_ylabel(wrapped(spoken(results.plan, found.column), 50))
+    labelled(axes, wrapped(load_label(results.plan), 80), wrapped(spoken(results.plan, found.column), 50))
     for which in "xy":
         if getattr(axes, f"get_{which}scale")() == "linear":
             axes.set(**{f"{which}lim": (0, None)})
-    axes.grid(alpha=0.3)
     axes.legend(ncols=3, **BELOW)
     _number_points(axes, found)
     when = "each point's last step" if found.step is None else f"step {found.step}"
-    data = {"nature": found.nature, "method": found.method, "estimator": found.estimator}
+    data = {name: getattr(found, name) for name in studies.HOW}
     more = ["bars: 95 % confidence"] if found.error is not None else []
     more += [_not_drawn(results.failed)] if results.failed else []
     more += [f"{name} = {shortened(value)}" for name, value in found.fixed.items()]

@@ -188,24 +188,19 @@ def _value(plan: Plan, name: str, given: Any) -> Any:
     if axis.values is None:
         raise UsageError(f"--where: expected a key with listed values, got {name}, which varies continuously")
     for value in axis.values:
-        if str(value) == str(given) or _number(value) == _number(given) is not None or _same(value, given):
+        if str(value) == str(given) or _meant(value) == _meant(given):
             return value
     raise UsageError(f"--where {name}: expected {_listed(axis, ' or ')}, got {given}")
 
 
-def _same(value: Any, given: Any) -> bool:
-    """Whether two texts are the same list in JSON."""
-    try:
-        return json.loads(value) == json.loads(given)
-    except (TypeError, ValueError):
-        return False
-
-
-def _number(value: Any) -> float | None:
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        return None
+def _meant(value: Any) -> Any:
+    """A value as it is or as text: the same number or list, however it is written; else the text."""
+    for read in (float, json.loads):
+        try:
+            return read(value)
+        except (TypeError, ValueError):
+            continue
+    return str(value)
 
 
 def _listed(axis: Axis, between: str = ", ") -> str:

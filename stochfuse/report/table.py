@@ -11,17 +11,19 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from rich import box
 from rich.console import Console
 from rich.table import Table as RichTable
 
+from stochfuse import __version__
 from stochfuse.errors import UsageError
 
 
@@ -73,11 +75,25 @@ class Report(NamedTuple):
         figure = None if draw is None else partial(draw, shown)
         return cls(partial(table, shown), partial(csv, shown), partial(json, shown), figure)
 
+    @classmethod
+    def of_rows(cls, title: Sequence[str], headings: Sequence[str], rows: Sequence[Sequence[Any]], json: Any) -> Report:
+        """Return a report of a plain list, which a table and CSV show alike, and its JSON object."""
+        cells = tuple(tuple("" if cell is None else str(cell) for cell in row) for row in rows)
+        return cls(
+            lambda: Table(tuple(title), tuple(headings), (), cells), partial(to_csv, headings, rows), lambda: json
+        )
+
 
 def number(value: float, digits: int = 5) -> str:
     """Return a number with so many significant digits, trailing zeros kept."""
     text = f"{value:#.{digits}g}"
     return text[:-1] if text.endswith(".") else text
+
+
+def counted(number: int, what: str) -> str:
+    """Return a number with its noun: "1 point", "1,100 points"."""
+    shown = f"{number:,}" if number < 10**15 else f"{number:.3g}"
+    return f"{shown} {what}{'s' * (number != 1)}"
 
 
 MOST_ROWS = 400
@@ -209,13 +225,18 @@ def _blocks(table: Table, text: Sequence[bool], room: int) -> Iterator[list[int]
     yield block
 
 
-def to_csv(headings: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Return comma-separated values, numbers in full precision."""
+def to_csv(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return comma-separated values, numbers in full precision; None is an empty cell."""
     output = io.StringIO()
     writer = csv.writer(output, lineterminator="\n")
     writer.writerow(headings)
     writer.writerows(rows)
     return output.getvalue()
+
+
+def records_csv(headings: Sequence[str], records: Iterable[Mapping[str, object]]) -> str:
+    """Return comma-separated values of the entries of records that the headings name."""
+    return to_csv(headings, ([record[name] for name in headings] for record in records))
 
 
 def to_markdown(table: Table) -> str:
@@ -299,6 +320,22 @@ PLOT_SUFFIXES = (".png", ".svg", ".pdf")
 def to_json(value: Any) -> str:
     """One object, indented; NaN and infinity are an error."""
     return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def stamped(schema: str, **facts: Any) -> dict[str, Any]:
+    """Return an object for JSON that says which schema it follows and which version wrote it."""
+    return {"schema": schema, "version": __version__, **facts}
+
+
+def listed(values: Any) -> Any:
+    """Return a number or nested lists of numbers for JSON and CSV, None in the place of what is not finite."""
+    values = np.asarray(values)
+    missing = ~np.isfinite(values)
+    if not missing.any():
+        return values.tolist()
+    out = values.astype(object)
+    out[missing] = None
+    return out.tolist()
 
 
 def terminal_width() -> int:

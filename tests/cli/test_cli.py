@@ -311,7 +311,7 @@ BAD = [
     (["scenario", "new", "--output", "x.json"], "error: x.json: a new scenario is TOML"),
     (["derive", "--latex", "--format", "json"], "error: --latex and --format: expected one of them, got both"),
     (["derive", "--agents", "100000"], "error: agents: expected 1 to 100 for formulas, got 100000"),
-    (["derive", "--q", "abc"], "error: q: expected a number, got 'abc'"),
+    (["derive", "--q", "abc"], "error: --q: expected a number, got 'abc'"),
     (["derive", "guess"], "Invalid value for"),
     (["scenario", "check", "nothing.toml"], "no such file"),
     (["nonsense"], "no command 'nonsense'; commands: predict, compare"),
