@@ -162,7 +162,7 @@ def run(
         ),
     ] = None,
     columns: Annotated[
-        str | None, option("The files' names of columns: z1=range,step=k.", SCENARIO + RARE, metavar="OURS=THEIRS")
+        str | None, option("The files' names of columns: z1=range,x=east|x_hat.", SCENARIO + RARE, metavar="OURS=THEIRS")
     ] = None,
     changes: Changes = Changes(),
     robots: RobotOptions = RobotOptions(),
@@ -201,7 +201,7 @@ def run(
     to.check(scenario, *files)
     given, links = changes.of(scenario)
     first = initial or beside(measurements)
-    theirs = renamed(columns, "OURS=THEIRS")
+    theirs = {ours: names.split("|") for ours, names in renamed(columns, "OURS=THEIRS").items()}
     records = read_records(given, measurements, arrivals, truth, first, theirs, estimates)
     chosen = metric_of(metric or given.metric or "trace", given.model)
     way = estimating.way(given, links, seed)
