@@ -162,7 +162,8 @@ def run(
         ),
     ] = None,
     columns: Annotated[
-        str | None, option("The files' names of columns: z1=range,x=east|x_hat.", SCENARIO + RARE, metavar="OURS=THEIRS")
+        str | None,
+        option("The files' names of columns: z1=range,x=east|x_hat.", SCENARIO + RARE, metavar="OURS=THEIRS"),
     ] = None,
     changes: Changes = Changes(),
     robots: RobotOptions = RobotOptions(),

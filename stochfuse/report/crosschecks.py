@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import hypot, isfinite
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,7 @@ from stochfuse.kalman.metrics import metric
 from stochfuse.report.plot import DASHES, MARKERS, below, canvas, entry, labelled, shades, spread, titled
 from stochfuse.report.predictions import PredictionView
 from stochfuse.report.table import Report, Table, counted, listed, number, records_csv, stamped
-from stochfuse.scenario.registry import OPTIMAL
+from stochfuse.scenario.registry import ACTUAL, OPTIMAL
 
 SCHEMA = "stochfuse.crosscheck/1"
 NEES = "Expected NEES: squared error in units of the claimed covariance"
@@ -81,6 +83,21 @@ class CrosscheckView:
         return (summary(found), *(f"  {cause.text}" for cause in likely[:MOST_CAUSES]))
 
     @property
+    def seen(self) -> tuple[str, ...]:
+        """Of what agrees, in a line, how wrong it would have to be to show."""
+        v = self.verdict
+        shares = [
+            hypot(c.error, c.expected_error) / abs(c.expected) for c in v.cells if c.expected and isfinite(c.error)
+        ]
+        if not v.agrees or not shares:
+            return ()
+        far = 100.0 * NormalDist().inv_cdf(1.0 - v.alpha / 2.0 / len(v.cells))
+        least, most = (f"{far * share:.2g}" for share in (min(shares), max(shares)))
+        between = least if least == most else f"{least} to {most}"
+        unseen = "; what is claimed was not compared" if {quantity for quantity, _ in self.senses} == {ACTUAL} else ""
+        return (f"would have shown: a cell that is off by {between} %{unseen}",)
+
+    @property
     def titles(self) -> tuple[str, ...]:
         """Lines that say what is compared with what."""
         v = self.verdict
@@ -89,6 +106,7 @@ class CrosscheckView:
         return (
             f"Crosscheck of {v.results.source}: {self.says}",
             *notes,
+            *self.seen,
             *self.causes,
             *(f"against: {self.what(*sense)}" for sense in self.senses),
             view.whom.partition(";")[0],

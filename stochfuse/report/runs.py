@@ -71,7 +71,8 @@ def _beside(found: RunResult) -> tuple[str, ...]:
 
 def _share(row: Row) -> str:
     share = 100.0 * (row.predicted / row.realised - 1.0)  # type: ignore[operator]
-    return f"{abs(share):.2g} % {'below' if share < 0 else 'above'}"
+    size = f"{abs(share):.2g}" if abs(share) < 99.5 else f"{abs(share):,.0f}"
+    return f"{size} % {'below' if share < 0 else 'above'}"
 
 
 def _shown(found: RunResult) -> list[Row]:

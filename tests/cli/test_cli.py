@@ -524,6 +524,12 @@ def test_crosscheck_verdict_is_the_exit_code(tmp_path):
     run("crosscheck", "-", "-", code=2, input="")
 
 
+def test_crosscheck_says_what_would_have_shown():
+    """P is 100, 50 or 100/3 with 1/4, 1/2, 1/4: a deviation of 25; 3.2905 of them in 1,000 by chance, 100 runs."""
+    done = run("crosscheck", "-", input="link,step,agent,covariance,count\n0.5,1,1,58.4,100\n").stdout
+    assert f"would have shown: a cell that is off by {100 * 3.2905 * 2.5 / 58.333:.2g} %\n" in done
+
+
 def test_crosscheck_by_case(tmp_path):
     (tmp_path / "s.toml").write_text(
         "model = {F = 1, H = 1, Q = 25, R = 100}\ninitial = {P = 100}\n"
