@@ -60,7 +60,7 @@ def whole(text: str) -> int | None:
 
 
 def whose(agent: str | None, scenario: Scenario) -> int | str:
-    """Return the agent asked for: a number, or mean, worst or best.
+    """Return the agent asked for: its number, where it is given by number or by name, or mean, worst or best.
 
     Raises
     ------
@@ -68,9 +68,13 @@ def whose(agent: str | None, scenario: Scenario) -> int | str:
         If there is no such agent.
     """
     chosen = (scenario.agent or "mean") if agent is None else whole(agent) or agent
-    most = scenario.network.agents
+    most, names = scenario.network.agents, scenario.network.names
+    if chosen in names:
+        return names.index(str(chosen)) + 1
     if chosen not in ("mean", "worst", "best") and not (isinstance(chosen, int) and 1 <= chosen <= most):
-        raise UsageError(f"agent: expected mean, worst, best or a number from 1 to {most}, got '{agent}'")
+        named = f", or one of {', '.join(names)}" if names else ""
+        like = nearest(str(agent), names)
+        raise UsageError(f"agent: expected mean, worst, best or a number from 1 to {most}{named}, got '{agent}'{like}")
     return chosen
 
 

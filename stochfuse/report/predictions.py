@@ -247,7 +247,7 @@ class PredictionView:
         if self.prediction.alike:
             return "every agent alike" if any(len(part.group_of) > 1 for part in self.parts) else "alone"
         random = self.statistic not in ("mean", "derivative") and self.agent == "mean"
-        return "of an agent picked at random" if random else whose(self.agent)
+        return "of an agent picked at random" if random else whose(self.agent, self.prediction.scenario.network.names)
 
     @property
     def how(self) -> str:

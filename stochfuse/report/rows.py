@@ -24,14 +24,15 @@ from stochfuse.scenario.over import LINK, Over
 Cells = tuple[Any, ...]
 
 
-def whose(agent: int | str) -> str:
-    """Whose covariance it is, in words."""
+def whose(agent: int | str, names: Sequence[str] = ()) -> str:
+    """Whose covariance it is, in words; `names` of the agents, where they have some."""
     texts = {
         "mean": "covariance averaged over the agents",
         "worst": "the agent with the largest value",
         "best": "the agent with the smallest value",
     }
-    return texts.get(str(agent), f"agent {agent}")
+    named = f" ({names[agent - 1]})" if names and isinstance(agent, int) else ""
+    return texts.get(str(agent), f"agent {agent}{named}")
 
 
 @dataclass(frozen=True)

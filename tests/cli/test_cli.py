@@ -530,6 +530,14 @@ def test_crosscheck_says_what_would_have_shown():
     assert f"would have shown: a cell that is off by {100 * 3.2905 * 2.5 / 58.333:.2g} %\n" in done
 
 
+def test_agents_go_by_name_too():
+    by_name, by_number = (run("predict", "road-5", "--agent", agent, "--at", "last").stdout for agent in ("B", "2"))
+    assert by_name == by_number
+    assert "; agent 2 (B)\n" in by_name
+    refused = run("predict", "road-5", "--agent", "b", code=2).stderr
+    assert "a number from 1 to 5, or one of A, B, C, D, E, got 'b'\n" in refused
+
+
 def test_crosscheck_by_case(tmp_path):
     (tmp_path / "s.toml").write_text(
         "model = {F = 1, H = 1, Q = 25, R = 100}\ninitial = {P = 100}\n"
