@@ -122,7 +122,9 @@ MetricOption = Annotated[
         metavar="NAME", autocompletion=completed([m.name.partition("STATE")[0] for m in registry.METRIC]),
     ),
 ]  # fmt: skip
-AgentOption = Annotated[str | None, option("Whose: mean (the default), worst, best, a number or a name.", SHOWN, metavar="N")]
+AgentOption = Annotated[
+    str | None, option("Whose: mean (the default), worst, best, a number or a name.", SHOWN, metavar="N")
+]
 QuantityOption = Annotated[
     str,
     option(
