@@ -294,6 +294,13 @@ class Followed:
         change = (K @ y[..., None])[..., 0]
         self.x[:, rows] += change.reshape(len(change), len(rows), 3)
 
+    def errors(self, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
+        """Squared errors of position and NEES of a step, each (items, robots)."""
+        e = self.x - self.course.record.truth[moment.step]
+        e[..., 2] = wrapped(e[..., 2])
+        nees = (e[..., None, :] @ np.linalg.solve(moment.claims, e[..., None]))[..., 0, 0]
+        return e[..., 0] ** 2 + e[..., 1] ** 2, nees
+
 
 class RobotMoments:
     """Second moments of the errors along a path (steps, robots, 3): E (items, 3n, 3n) and M (items, 3n, biases).
@@ -371,6 +378,12 @@ class RobotMoments:
         self.E[:, :, at] += NUMPY.transpose(change)
         self.E[:, at[:, None], at] += K @ yy @ NUMPY.transpose(K)
         self.M[:, at] += K @ yb
+
+    def errors(self, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
+        """Expected squared errors of position and NEES of a step, each (items, robots)."""
+        E = self.blocks()
+        nees = np.trace(np.linalg.solve(moment.claims, E), axis1=-2, axis2=-1)
+        return E[..., [0, 1], [0, 1]].sum(axis=-1), nees
 
 
 class Moment(NamedTuple):

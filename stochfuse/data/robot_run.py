@@ -29,7 +29,6 @@ from stochfuse.data.robot_filters import (
     ESTIMATORS,
     Assumed,
     Followed,
-    Moment,
     RobotMoments,
     RobotPath,
     assumed,
@@ -161,9 +160,10 @@ def run_robots(
     rows: list[RobotRow] = []
     for k, name in enumerate(estimators):
         listener().advance(name, 2 * k, 2 * len(estimators))
-        real = _realised(course, name, told, items, last)
+        real = _found(course, name, told, items.heard, Followed(course, len(items.heard)), last)
         listener().advance(f"{name}, predicted", 2 * k + 1, 2 * len(estimators))
-        rows += _rows(name, record, real, _expected(course, name, told, noises, alone.path, others, last), items)
+        carried = RobotMoments(course, noises, alone.path, len(others.heard))
+        rows += _rows(name, record, real, _found(course, name, told, others.heard, carried, last), items)
     return RobotRun(used, noises, until, runs, white, tuple(rows), alone.error, alone.deviation)
 
 
@@ -219,27 +219,19 @@ def _alone(course: RobotPath, noises: ChannelNoises, told: Assumed, last: int) -
     path, realised = [], []
     for moment in filtered(course, "stand-alone", told, nobody, followed):
         path.append(followed.x[0].copy())
-        realised.append(_errors(followed, record, moment)[1][0])
+        realised.append(followed.errors(moment)[1][0])
     path = np.array(path)
     expected = RobotMoments(course, noises, path, 1)
     first, n = min(record.step_at(FORGOTTEN), last // 2), len(record.robots)
     deviation, ratio = np.zeros_like(path), np.zeros((record.steps, n))
     for moment in filtered(course, "stand-alone", told, nobody, expected):
-        E = expected.blocks()
-        deviation[moment.step] = np.sqrt(np.diagonal(E[0], axis1=-2, axis2=-1))
-        ratio[moment.step] = np.trace(np.linalg.solve(moment.claims[0], E[0]), axis1=-2, axis2=-1) / 3.0
+        deviation[moment.step] = np.sqrt(np.diagonal(expected.blocks()[0], axis1=-2, axis2=-1))
+        ratio[moment.step] = expected.errors(moment)[1][0] / 3.0
     error = path - record.truth
     error[..., 2] = wrapped(error[..., 2])
     factor = np.maximum(ratio[first:last].mean(axis=0), 1e-3)
     beyond = float((np.array(realised)[first:last].mean(axis=0) / 3.0 / factor).mean())
     return _Alone(path, error, deviation, factor * max(beyond, 1.0))
-
-
-def _errors(followed: Followed, record: RobotRecord, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
-    """Errors (items, robots, 3) of what is believed, and their NEES."""
-    e = followed.x - record.truth[moment.step]
-    e[..., 2] = wrapped(e[..., 2])
-    return e, (e[..., None, :] @ np.linalg.solve(moment.claims, e[..., None]))[..., 0, 0]
 
 
 class _Found(NamedTuple):
@@ -250,32 +242,15 @@ class _Found(NamedTuple):
     nees: np.ndarray
 
 
-def _realised(course: RobotPath, name: str, told: Assumed, items: _ArrivalDraws, last: int) -> _Found:
-    followed, found = Followed(course, len(items.heard)), []
-    for moment in filtered(course, name, told, items.heard, followed):
-        if moment.step <= last:
-            continue
-        e, nees = _errors(followed, course.record, moment)
-        found.append((e[..., 0] ** 2 + e[..., 1] ** 2, moment.claims[..., [0, 1], [0, 1]].sum(axis=-1), nees))
-    return _Found(*map(np.array, zip(*found, strict=True)))
-
-
-def _expected(
-    course: RobotPath,
-    name: str,
-    told: Assumed,
-    noises: ChannelNoises,
-    path: np.ndarray,
-    items: _ArrivalDraws,
-    last: int,
+def _found(
+    course: RobotPath, name: str, told: Assumed, heard: np.ndarray, carried: Followed | RobotMoments, last: int
 ) -> _Found:
-    expected, found = RobotMoments(course, noises, path, len(items.heard)), []
-    for moment in filtered(course, name, told, items.heard, expected):
-        if moment.step <= last:
-            continue
-        E = expected.blocks()
-        nees = np.trace(np.linalg.solve(moment.claims, E), axis1=-2, axis2=-1)
-        found.append((E[..., [0, 1], [0, 1]].sum(axis=-1), moment.claims[..., [0, 1], [0, 1]].sum(axis=-1), nees))
+    """Of an estimator after the calibration run: realised where the record is followed, else as it should be."""
+    found = []
+    for moment in filtered(course, name, told, heard, carried):
+        if moment.step > last:
+            squared, nees = carried.errors(moment)
+            found.append((squared, moment.claims[..., [0, 1], [0, 1]].sum(axis=-1), nees))
     return _Found(*map(np.array, zip(*found, strict=True)))
 
 
