@@ -24,7 +24,6 @@ from typing import NamedTuple
 import numpy as np
 
 from stochfuse.errors import UsageError
-from stochfuse.kalman.checks import INDEFINITE
 from stochfuse.kalman.compiled import LANES, Loop, Matrices, pays, whole
 from stochfuse.kalman.kernel import Estimate, factor, from_factor, predict, predict_factor, update_factor
 
@@ -36,6 +35,8 @@ FEWEST = 512
 """Filters in a block at least: a call costs as much as some hundred of them."""
 ONE_PRODUCT = 6
 """States up to which one product for all rows is less work than two for each side."""
+INDEFINITE = -1e-9
+"""Most negative eigenvalue, scaled to unit diagonal, that is taken for rounding of a singular matrix."""
 EVERY = 8
 """Steps between two looks at what is left."""
 _TINY = 1e-300
@@ -228,7 +229,7 @@ def _carry_compiled(
     if share is not None and not (share == 1.0).all():
         P = P * share[:, None, None]
     cuts = [k for k in range(1, len(through)) if k % EVERY == 0 or through[k] is not through[k - 1]]
-    size = whole(max(LANES, CACHE // (d * d * (EVERY if each else 1) + d + p)))
+    size = whole(min(items, max(LANES, CACHE // (d * d * (EVERY if each else 1) + d + p))))
     left, watched, memory = np.ones(items), np.empty((p + d, size)), np.empty((EVERY if each else 0, d, d, size))
     for first in range(0, items, size):
         block = np.s_[first : min(first + size, items)]
@@ -379,7 +380,7 @@ class _FilterBlock:
         if self.one and Q.ndim == 2:
             self.C[:, 1:] = self.C[:, :1]
         self.watch.begin(R)
-        self.C[n + p * d :] += upper(R)[triangle(p)[2].ravel()]
+        self.C[n + p * d :] += self.watch.R[triangle(p)[2].ravel()]
 
     def advance(self, k: int, last: bool) -> None:
         """Predict and update, the k-th time, counted from 0."""
