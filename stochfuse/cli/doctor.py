@@ -39,6 +39,7 @@ def _version(name: str) -> str | None:
 
 def doctor(format: FormatOption = None, output: OutputOption = None) -> None:
     """Show versions, extras and threads, and what is missing with the line that installs it."""
+    from stochfuse.kalman import compiled
     from stochfuse.report.table import Report, Table, to_csv
 
     check_files(output, None)
@@ -52,11 +53,19 @@ def doctor(format: FormatOption = None, output: OutputOption = None) -> None:
     machine = f"{platform.system()} {platform.machine()}, {cores} cores; threads of matrix products: " + ", ".join(
         f"{name} {value}" for name, value in threads.items()
     )
+    machine += f"; compiled filters: {compiled.state()}"
     keys = ("package", "extra", "version", "to install")
     facts = [dict(zip(("package", "extra", "version", "install"), row, strict=True)) for row in rows]
     report = Report(
         lambda: Table(("What is installed", machine), keys, (), tuple(rows)),
         lambda: to_csv(keys, rows),
-        lambda: {"schema": SCHEMA, "version": __version__, "cores": cores, "threads": threads, "packages": facts},
+        lambda: {
+            "schema": SCHEMA,
+            "version": __version__,
+            "cores": cores,
+            "threads": threads,
+            "compiled": compiled.state(),
+            "packages": facts,
+        },
     )
     write_report(report, chosen_format(format, output), output)

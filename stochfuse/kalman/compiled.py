@@ -1,9 +1,10 @@
 """A recursion of matrices, the same for each of many items, compiled when there is enough of it.
 
 The step is run once on arrays of `Term`, which write down what is done to them: no equation is written a second time.
-That list, in the language of LLVM, becomes the body of a loop over groups of `LANES` neighbouring items; an operation is
-one vector instruction, a product and the sum that it goes into are one.  All steps of a group come before the next group:
-what it goes by is read once and stays in registers and the nearest cache, where NumPy passes memory at every operation.
+That list, in the language of LLVM, becomes the body of a loop over groups of `LANES` neighbouring items; an operation
+is one vector instruction, a product and the sum that it goes into are one.  All steps of a group come before the next
+group: what it goes by is read once and stays in registers and the nearest cache, where NumPy passes memory at every
+operation.
 
 Needs the package llvmlite (extra `compiled`), whose import takes 0.1 s once, and then 0.02 to 0.5 s for 2 to 9 states;
 nothing is kept on disk.  Without it answers are the same up to rounding.  The environment variable STOCHFUSE_COMPILED

@@ -183,7 +183,7 @@ def carry(
         (items,) smallest share of variance that is left of what was there before; at most what it is.
     """
     d, p, items = out.shape[1], through[0].H.shape[-2], out.shape[-1]
-    if d > 1 and items and pays(items * len(through), _products(d, p)) and _compiled(d, p, through[0].own()):
+    if d > 1 and items and pays(items * len(through), _products(d, p)) and compiled_step(d, p, through[0].own()):
         return _carry_compiled(P, through, out, share, unsound, after)
     own = any(M.ndim == 3 for M in (through[0].F, through[0].H))
     heights = _heights(d, p, own)
@@ -241,7 +241,7 @@ def _carry_compiled(
             if not k or through[k] is not through[k - 1]:
                 watch.begin(step.R)
             made = memory[: end - k, ..., :width] if each else out[..., block]
-            loop = _compiled(d, p, step.own())
+            loop = compiled_step(d, p, step.own())
             loop(now, watched, step, end - k, made)
             if each:
                 out[k:end, ..., block] = made
@@ -257,7 +257,7 @@ def _carry_compiled(
 
 
 @lru_cache(maxsize=64)
-def _compiled(d: int, p: int, own: tuple[bool, ...]) -> Loop | None:
+def compiled_step(d: int, p: int, own: tuple[bool, ...]) -> Loop | None:
     """The step of `_FilterBlock`, compiled for matrices of all or each filter's own; None where nothing compiles."""
     triangles, place = triangle(p)[2].ravel(), triangle(d)[2]
 
