@@ -69,7 +69,7 @@ def _all_fine(stack: np.ndarray, beyond: float) -> bool:
     P, mirrored = flat[rows * d + columns], flat[columns * d + rows]
     with np.errstate(all="ignore"):
         variances = P[place.diagonal()]
-        if (P != mirrored).any():
+        if (mirrored != P).any():
             scale = np.sqrt(np.where(variances > 0, variances, 1.0))
             if not (np.abs(P - mirrored) <= SYMMETRY * scale[rows] * scale[columns]).all():
                 return False

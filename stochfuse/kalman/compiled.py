@@ -218,7 +218,7 @@ def _text(place: np.ndarray, watched: int, given: Sequence[Matrices], step: Step
         name = _offset("out", i, j, parts["entry"])
         parts["show"] += [
             f"{name}.p = getelementptr i8, ptr %here, i64 {name}",
-            f"call void {_STORE}({_NUMBERS} {becomes[place[i, j]].name}, ptr {name}.p, i32 8, {_MASK} %mask)",
+            f"call void {_STORE}({_NUMBERS} {becomes[int(place[i, j])].name}, ptr {name}.p, i32 8, {_MASK} %mask)",
         ]
     return _FRAME.format(**{part: "\n".join(lines) for part, lines in parts.items()})
 

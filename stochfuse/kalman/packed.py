@@ -12,6 +12,8 @@ which is (24) and (26) for the optimal gain.  That subtraction loses about log10
 share `left` of a variance.  What is left at least is read off the rows as they pass, and off the first and the last of
 them, so that no step pays for a check; filters that may have lost too much are done again in square-root form
 (`stochfuse.kalman.kernel.update_factor`).
+
+Where there is a compiler and enough to do, the same lines run compiled (`stochfuse.kalman.compiled`).
 """
 
 from __future__ import annotations
@@ -175,7 +177,7 @@ def carry(
     out : (1, d, d, items) for the last posterior, or (steps, d, d, items) for all of them: filled.
     share : (items,) factors of P.
     unsound : (items,) set where the last covariance is not finite, or no covariance.
-    after : hears of every step of a block, from 1.
+    after : hears how many steps of a block have been done.
 
     Returns
     -------
@@ -183,8 +185,8 @@ def carry(
         (items,) smallest share of variance that is left of what was there before; at most what it is.
     """
     d, p, items = out.shape[1], through[0].H.shape[-2], out.shape[-1]
-    if d > 1 and items and pays(items * len(through), _products(d, p)) and compiled_step(d, p, through[0].own()):
-        return _carry_compiled(P, through, out, share, unsound, after)
+    if loops := _loops(d, p, items, through):
+        return _carry_compiled(loops, P, through, out, share, unsound, after)
     own = any(M.ndim == 3 for M in (through[0].F, through[0].H))
     heights = _heights(d, p, own)
     blocks = -(-items // max(FEWEST, CACHE // sum(heights)))
@@ -216,6 +218,7 @@ def carry(
 
 
 def _carry_compiled(
+    loops: dict[tuple[bool, ...], Loop],
     P: np.ndarray,
     through: Sequence[Step],
     out: np.ndarray,
@@ -233,16 +236,15 @@ def _carry_compiled(
     left, watched, memory = np.ones(items), np.empty((p + d, size)), np.empty((EVERY if each else 0, d, d, size))
     for first in range(0, items, size):
         block = np.s_[first : min(first + size, items)]
-        width, now = block.stop - first, P[block]
+        width, now, made = block.stop - first, P[block], out[..., block]
         watched[:] = 0.0
         watch = _Watch(d, p, watched[:p, :width], watched[p:, :width])
         for k, end in pairwise([0, *cuts, len(through)]):
             step = through[k].take(block)
             if not k or through[k] is not through[k - 1]:
                 watch.begin(step.R)
-            made = memory[: end - k, ..., :width] if each else out[..., block]
-            loop = compiled_step(d, p, step.own())
-            loop(now, watched, step, end - k, made)
+            made = memory[: end - k, ..., :width] if each else made
+            loops[step.own()](now, watched, step, end - k, made)
             if each:
                 out[k:end, ..., block] = made
             now = made[-1].transpose(2, 0, 1)
@@ -283,6 +285,15 @@ def compiled_step(d: int, p: int, own: tuple[bool, ...]) -> Loop | None:
         return None
 
 
+def _loops(d: int, p: int, items: int, through: Sequence[Step]) -> dict[tuple[bool, ...], Loop]:
+    """Compiled steps of every kind that is needed; none where one does not compile, or where it does not pay."""
+    if d == 1 or not items or not pays(items * len(through), _products(d, p)):
+        return {}
+    loops = {own: compiled_step(d, p, own) for own in {step.own() for step in through}}
+    found = {own: loop for own, loop in loops.items() if loop is not None}
+    return found if len(found) == len(loops) else {}
+
+
 def _products(d: int, p: int) -> int:
     """About how many products a step takes that is written out."""
     return d * d * (3 * d + 1) // 2 + 2 * p * d * (d + p)
@@ -315,7 +326,7 @@ class _Watch:
 
     def __init__(self, d: int, p: int, most: np.ndarray, peak: np.ndarray) -> None:
         self.d, self.p, self.most, self.peak = d, p, most, peak
-        self.left, self.R = np.ones(peak.shape[1]), None
+        self.left, self.R = np.ones(peak.shape[1]), np.empty((0, 0))
 
     def begin(self, R: np.ndarray) -> None:
         """Steps with the noise R are to come."""
@@ -337,11 +348,11 @@ class _Watch:
 
         s ≤ Σ (S_ii − R_ii)/R_ii where the noises are independent; where they are not, it grows as R is singular.
         """
-        if self.R is None:
+        if not len(self.R):
             return
         gained = np.add.reduce(self.most / self.R[triangle(self.p)[2].diagonal()]) - self.p
         left = 1.0 if self.p == 1 else smallest_pivot(self.R, self.p)
-        self.left, self.R = np.minimum(self.left, left / (1.0 + gained)), None
+        self.left, self.R = np.minimum(self.left, left / (1.0 + gained)), self.R[:0]
         self.most[:] = 0.0
 
 
