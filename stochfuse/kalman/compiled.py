@@ -109,7 +109,7 @@ class Loop:
         Parameters
         ----------
         start : (items, d, d) to begin with.
-        watched : (numbers, at least `whole(items)`), the items in one piece: overwritten.
+        watched : (numbers, at least `padded(items)`), the items in one piece: overwritten.
         given : matrices (items, ., .), or (., .) of all.
         steps : how many.
         out : (1, d, d, items) for the last matrices, or (steps, d, d, items), the items in one piece: filled.
@@ -123,8 +123,8 @@ class Loop:
         self._run(table.ctypes.data)
 
 
-def whole(items: int) -> int:
-    """Items in whole groups."""
+def padded(items: int) -> int:
+    """Return how many items whole groups have."""
     return -(-items // LANES) * LANES
 
 

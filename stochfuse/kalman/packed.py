@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stochfuse.errors import UsageError
-from stochfuse.kalman.compiled import LANES, Loop, Matrices, pays, whole
+from stochfuse.kalman.compiled import LANES, Loop, Matrices, padded, pays
 from stochfuse.kalman.kernel import Estimate, factor, from_factor, predict, predict_factor, update_factor
 
 CANCELLATION = 1e-5
@@ -232,7 +232,7 @@ def _carry_compiled(
     if share is not None and not (share == 1.0).all():
         P = P * share[:, None, None]
     cuts = [k for k in range(1, len(through)) if k % EVERY == 0 or through[k] is not through[k - 1]]
-    size = whole(min(items, max(LANES, CACHE // (d * d * (EVERY if each else 1) + d + p))))
+    size = padded(min(items, max(LANES, CACHE // (d * d * (EVERY if each else 1) + d + p))))
     left, watched, memory = np.ones(items), np.empty((p + d, size)), np.empty((EVERY if each else 0, d, d, size))
     for first in range(0, items, size):
         block = np.s_[first : min(first + size, items)]
