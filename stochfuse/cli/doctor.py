@@ -54,18 +54,12 @@ def doctor(format: FormatOption = None, output: OutputOption = None) -> None:
         f"{name} {value}" for name, value in threads.items()
     )
     machine += f"; compiled filters: {compiled.state()}"
+    settings = {"threads": threads, "compiled": compiled.state()}
     keys = ("package", "extra", "version", "to install")
     facts = [dict(zip(("package", "extra", "version", "install"), row, strict=True)) for row in rows]
     report = Report(
         lambda: Table(("What is installed", machine), keys, (), tuple(rows)),
         lambda: to_csv(keys, rows),
-        lambda: {
-            "schema": SCHEMA,
-            "version": __version__,
-            "cores": cores,
-            "threads": threads,
-            "compiled": compiled.state(),
-            "packages": facts,
-        },
+        lambda: {"schema": SCHEMA, "version": __version__, "cores": cores, "packages": facts, **settings},
     )
     write_report(report, chosen_format(format, output), output)

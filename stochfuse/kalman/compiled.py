@@ -19,7 +19,7 @@ import os
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from importlib.util import find_spec
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -36,6 +36,7 @@ MOST = 10_000
 _NUMBERS, _PLACES, _MASK, _POINTERS = (f"<{LANES} x {kind}>" for kind in ("double", "i64", "i1", "ptr"))
 _GATHER, _STORE = f"@llvm.masked.gather.v{LANES}f64.v{LANES}p0", f"@llvm.masked.store.v{LANES}f64.p0"
 
+Entries = Sequence[tuple[int, int]]
 Step = Callable[..., tuple[Sequence["Term"], Sequence["Term"]]]
 
 
@@ -69,13 +70,6 @@ class Term:
         return self._write(f"select {_MASK} {larger.name}, {_NUMBERS} {self.name}, {_NUMBERS} {other.name}")
 
 
-class Matrices(NamedTuple):
-    """Which entries are read of a matrix, and whether every item has one of its own."""
-
-    entries: Sequence[tuple[int, int]]
-    own: bool = True
-
-
 class Loop:
     """A compiled recursion; raises OSError or RuntimeError where this machine compiles nothing.
 
@@ -83,12 +77,12 @@ class Loop:
     ----------
     place : (d, d) which of the carried numbers stands where in the matrix that a step makes anew.
     watched : how many numbers beside them a step makes anew.
-    given : matrices that it goes by.
+    given : which entries are read of each matrix that it goes by.
     step : from the terms of the carried numbers, those watched and the entries of each matrix given, one-dimensional
         arrays, to what the carried numbers and those watched become.
     """
 
-    def __init__(self, place: np.ndarray, watched: int, given: Sequence[Matrices], step: Step) -> None:
+    def __init__(self, place: np.ndarray, watched: int, given: Sequence[Entries], step: Step) -> None:
         import llvmlite.binding as llvm
 
         llvm.initialize_native_target()
@@ -96,8 +90,11 @@ class Loop:
         machine = llvm.Target.from_default_triple().create_target_machine(
             cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=2
         )
-        module = llvm.parse_assembly(_text(place, watched, given, step))
-        self._engine: Any = llvm.create_mcjit_compiler(module, machine)  # the code lives as long as this does
+        first = np.unique(place, return_index=True)[1]
+        self._out = list(np.ndindex(place.shape))
+        self._read = [[self._out[at] for at in first], *given]
+        text = _text(place.ravel().tolist(), watched, [len(entries) for entries in self._read], step)
+        self._engine: Any = llvm.create_mcjit_compiler(llvm.parse_assembly(text), machine)  # it keeps the code
         self._engine.finalize_object()
         self._run = ctypes.CFUNCTYPE(None, ctypes.c_void_p)(self._engine.get_function_address("run"))
 
@@ -114,11 +111,14 @@ class Loop:
         steps : how many.
         out : (1, d, d, items) for the last matrices, or (steps, d, d, items), the items in one piece: filled.
         """
-        apart = out.strides[0] if len(out) > 1 else 0
-        words = [steps, len(start), out.ctypes.data, apart, *out.strides[1:3], watched.ctypes.data, watched.strides[0]]
+        down, right = out.strides[1:3]
+        words = [steps, len(start), out.strides[0] if len(out) > 1 else 0]
+        words += [out.ctypes.data + i * down + j * right for i, j in self._out]
+        words += [watched.ctypes.data + i * watched.strides[0] for i in range(len(watched))]
         arrays = [np.asarray(M, dtype=float) for M in (start, *given)]
-        for M in arrays:
-            words += [M.ctypes.data, *((0, *M.strides) if M.ndim == 2 else M.strides)]
+        for M, entries in zip(arrays, self._read, strict=True):
+            down, right = M.strides[-2:]
+            words += [M.strides[0] if M.ndim == 3 else 0, *(M.ctypes.data + i * down + j * right for i, j in entries)]
         table = np.array(words, dtype=np.int64)
         self._run(table.ctypes.data)
 
@@ -145,7 +145,6 @@ group:
 %lane = add {_PLACES} %firsts, <{", ".join(f"i64 {lane}" for lane in range(LANES))}>
 %mask = icmp sle {_PLACES} %lane, %ends
 %item = select {_MASK} %mask, {_PLACES} %lane, {_PLACES} %ends
-%to = getelementptr double, ptr %out, i64 %first
 {{group}}
 br label %step
 step:
@@ -159,7 +158,6 @@ step:
 br i1 %due, label %show, label %on
 show:
 %far = mul i64 %k, %apart
-%here = getelementptr i8, ptr %to, i64 %far
 {{show}}
 br label %on
 on:
@@ -174,97 +172,56 @@ ret void
 }}}}
 """
 """The loops.  The last group is filled up with the last item, and what is beyond it is not stored."""
-_WORDS = ("steps", "items", "out", "apart", "outrow", "outcolumn", "watched", "watchedrow")
-"""What `Loop.__call__` passes first; of each matrix there follow the address and the strides, in bytes."""
 
 
-def _text(place: np.ndarray, watched: int, given: Sequence[Matrices], step: Step) -> str:
-    """Return the loops around a step as LLVM reads them."""
+def _text(place: Sequence[int], watched: int, read: Sequence[int], step: Step) -> str:
+    """Return the loops around a step as LLVM reads them; what is in their table, `Loop.__call__` says."""
     written: dict[str, str] = {}
 
     def terms(name: str, size: int) -> np.ndarray:
         return np.array([Term(f"%{name}.{i}", written) for i in range(size)], dtype=object)
 
-    rows, columns = np.unravel_index(np.unique(place, return_index=True)[1], place.shape)
-    read = {"start": Matrices(list(zip(rows.tolist(), columns.tolist(), strict=True)))}
-    read |= {f"given{j}": M for j, M in enumerate(given)}
-    now, seen = terms("now", len(rows)), terms("seen", watched)
-    becomes, then = step(now, seen, *(terms(name, len(M.entries)) for name, M in list(read.items())[1:]))
-
-    words = [*_WORDS, *(f"{name}{word}" for name in read for word in ("", "item", "row", "column"))]
-    pointers = {"out", "watched", *read}
-    parts: dict[str, list[str]] = {"entry": [], "group": [], "step": [], "show": [], "done": []}
+    now, seen = terms("now", read[0]), terms("seen", watched)
+    becomes, then = step(now, seen, *(terms(f"m{j}", size) for j, size in enumerate(read[1:], start=1)))
+    words = ["steps", "items", "apart", *(f"out.{i}" for i in range(len(place))), *(f"row.{i}" for i in range(watched))]
+    group, show, done = [], [], []
+    for j, size in enumerate(read):
+        words += [f"stride{j}", *(f"m{j}.{i}" for i in range(size))]
+        group += [
+            f"%one{j} = insertelement {_PLACES} poison, i64 %stride{j}, i32 0",
+            f"%each{j} = shufflevector {_PLACES} %one{j}, {_PLACES} poison, <{LANES} x i32> zeroinitializer",
+            f"%far{j} = mul {_PLACES} %item, %each{j}",
+        ]
+        for i in range(size):
+            group += [
+                f"%at{j}.{i} = getelementptr i8, ptr %in.m{j}.{i}, {_PLACES} %far{j}",
+                f"%m{j}.{i} = call {_NUMBERS} {_GATHER}"
+                f"({_POINTERS} %at{j}.{i}, i32 8, {_MASK} splat (i1 true), {_NUMBERS} poison)",
+            ]
+    for i, term in enumerate(then):
+        group += [
+            f"%kept.{i} = getelementptr double, ptr %in.row.{i}, i64 %first",
+            f"%was.{i} = load {_NUMBERS}, ptr %kept.{i}, align 8",
+        ]
+        done.append(f"store {_NUMBERS} {term.name}, ptr %kept.{i}, align 8")
+    for i, which in enumerate(place):
+        show += [
+            f"%to.{i} = getelementptr double, ptr %in.out.{i}, i64 %first",
+            f"%here.{i} = getelementptr i8, ptr %to.{i}, i64 %far",
+            f"call void {_STORE}({_NUMBERS} {becomes[which].name}, ptr %here.{i}, i32 8, {_MASK} %mask)",
+        ]
+    entry = []
     for at, word in enumerate(words):
-        kind = "ptr" if word in pointers else "i64"
-        parts["entry"] += [
-            f"%at.{word} = getelementptr i64, ptr %table, i64 {at}",
-            f"%{word} = load {kind}, ptr %at.{word}",
-        ]
-    for name, M in read.items():
-        _read(name, M, parts)
-    for i in range(watched):
-        parts["entry"] += [f"%w{i} = mul i64 %watchedrow, {i}", f"%row{i} = getelementptr i8, ptr %watched, i64 %w{i}"]
-        parts["group"] += [
-            f"%kept{i} = getelementptr double, ptr %row{i}, i64 %first",
-            f"%was.{i} = load {_NUMBERS}, ptr %kept{i}, align 8",
-        ]
-        parts["done"].append(f"store {_NUMBERS} {then[i].name}, ptr %kept{i}, align 8")
-    for name, before, after in (("now", "start", becomes), ("seen", "was", then)):
-        parts["step"] += [
-            f"%{name}.{i} = phi {_NUMBERS} [%{before}.{i}, %group], [{term.name}, %on]" for i, term in enumerate(after)
-        ]
-    parts["step"] += [f"{name} = {text}" for text, name in written.items()]
-    for i, j in np.ndindex(place.shape):
-        name = _offset("out", i, j, parts["entry"])
-        parts["show"] += [
-            f"{name}.p = getelementptr i8, ptr %here, i64 {name}",
-            f"call void {_STORE}({_NUMBERS} {becomes[int(place[i, j])].name}, ptr {name}.p, i32 8, {_MASK} %mask)",
-        ]
+        name, kind = (f"in.{word}", "ptr") if "." in word else (word, "i64")
+        entry += [f"%word.{at} = getelementptr i64, ptr %table, i64 {at}", f"%{name} = load {kind}, ptr %word.{at}"]
+    body = [
+        f"%{name}.{i} = phi {_NUMBERS} [%{before}.{i}, %group], [{term.name}, %on]"
+        for name, before, after in (("now", "m0", becomes), ("seen", "was", then))
+        for i, term in enumerate(after)
+    ]
+    body += [f"{name} = {text}" for text, name in written.items()]
+    parts = {"entry": entry, "group": group, "step": body, "show": show, "done": done}
     return _FRAME.format(**{part: "\n".join(lines) for part, lines in parts.items()})
-
-
-def _read(name: str, M: Matrices, parts: dict[str, list[str]]) -> None:
-    """Write how the entries of a matrix come into %name.0, %name.1 …: once for all, or for each group."""
-    if M.own:
-        parts["group"] += [
-            *_spread(f"%{name}.apart", "i64", f"%{name}item"),
-            f"%{name}.far = mul {_PLACES} %item, %{name}.apart",
-            f"%{name}.at = getelementptr i8, ptr %{name}, {_PLACES} %{name}.far",
-        ]
-    for e, (i, j) in enumerate(M.entries):
-        offset = _offset(name, i, j, parts["entry"])
-        if M.own:
-            parts["group"] += [
-                f"{offset}.p = getelementptr i8, {_POINTERS} %{name}.at, i64 {offset}",
-                f"%{name}.{e} = call {_NUMBERS} {_GATHER}"
-                f"({_POINTERS} {offset}.p, i32 8, {_MASK} splat (i1 true), {_NUMBERS} poison)",
-            ]
-        else:
-            parts["entry"] += [
-                f"{offset}.p = getelementptr i8, ptr %{name}, i64 {offset}",
-                f"{offset}.d = load double, ptr {offset}.p",
-                *_spread(f"%{name}.{e}", "double", f"{offset}.d"),
-            ]
-
-
-def _offset(name: str, row: int, column: int, lines: list[str]) -> str:
-    """Write where an entry of a matrix is, and return the name of that."""
-    offset = f"%{name}.{row}x{column}"
-    lines += [
-        f"{offset}.i = mul i64 %{name}row, {row}",
-        f"{offset}.j = mul i64 %{name}column, {column}",
-        f"{offset} = add i64 {offset}.i, {offset}.j",
-    ]
-    return offset
-
-
-def _spread(name: str, kind: str, value: str) -> list[str]:
-    """One number in every lane."""
-    vector = f"<{LANES} x {kind}>"
-    return [
-        f"{name}.one = insertelement {vector} poison, {kind} {value}, i32 0",
-        f"{name} = shufflevector {vector} {name}.one, {vector} poison, <{LANES} x i32> zeroinitializer",
-    ]
 
 
 @lru_cache(maxsize=1)

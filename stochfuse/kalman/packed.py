@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stochfuse.errors import UsageError
-from stochfuse.kalman.compiled import LANES, Loop, Matrices, padded, pays
+from stochfuse.kalman.compiled import LANES, Loop, padded, pays
 from stochfuse.kalman.kernel import Estimate, factor, from_factor, predict, predict_factor, update_factor
 
 CANCELLATION = 1e-5
@@ -101,10 +101,6 @@ class Step(NamedTuple):
     Q: np.ndarray
     H: np.ndarray
     R: np.ndarray
-
-    def own(self) -> tuple[bool, ...]:
-        """Whether every filter has one of its own, of each."""
-        return tuple(M.ndim == 3 for M in self)
 
     def take(self, items: slice) -> Step:
         """Return the same for some of the filters."""
@@ -185,8 +181,10 @@ def carry(
         (items,) smallest share of variance that is left of what was there before; at most what it is.
     """
     d, p, items = out.shape[1], through[0].H.shape[-2], out.shape[-1]
-    if loops := _loops(d, p, items, through):
-        return _carry_compiled(loops, P, through, out, share, unsound, after)
+    pay = d > 1 and items > 0 and pays(items * len(through), d * d * (3 * d + 1) // 2 + 2 * p * d * (d + p))
+    loop = compiled_step(d, p) if pay else None
+    if loop is not None:
+        return _carry_compiled(loop, P, through, out, share, unsound, after)
     own = any(M.ndim == 3 for M in (through[0].F, through[0].H))
     heights = _heights(d, p, own)
     blocks = -(-items // max(FEWEST, CACHE // sum(heights)))
@@ -218,7 +216,7 @@ def carry(
 
 
 def _carry_compiled(
-    loops: dict[tuple[bool, ...], Loop],
+    loop: Loop,
     P: np.ndarray,
     through: Sequence[Step],
     out: np.ndarray,
@@ -244,7 +242,7 @@ def _carry_compiled(
             if not k or through[k] is not through[k - 1]:
                 watch.begin(step.R)
             made = memory[: end - k, ..., :width] if each else made
-            loops[step.own()](now, watched, step, end - k, made)
+            loop(now, watched, step, end - k, made)
             if each:
                 out[k:end, ..., block] = made
             now = made[-1].transpose(2, 0, 1)
@@ -259,8 +257,8 @@ def _carry_compiled(
 
 
 @lru_cache(maxsize=64)
-def compiled_step(d: int, p: int, own: tuple[bool, ...]) -> Loop | None:
-    """The step of `_FilterBlock`, compiled for matrices of all or each filter's own; None where nothing compiles."""
+def compiled_step(d: int, p: int) -> Loop | None:
+    """The step of `_FilterBlock`, compiled; None where this machine compiles nothing."""
     triangles, place = triangle(p)[2].ravel(), triangle(d)[2]
 
     def step(P: np.ndarray, seen: np.ndarray, F: np.ndarray, Q: np.ndarray, H: np.ndarray, R: np.ndarray) -> tuple:
@@ -272,31 +270,12 @@ def compiled_step(d: int, p: int, own: tuple[bool, ...]) -> Loop | None:
         block.correct()
         return block.P[:, 0], [new.largest(before) for new, before in zip(now, seen, strict=True)]
 
-    entries = (
-        np.ndindex(d, d),
-        zip(*triangle(d)[:2], strict=True),
-        np.ndindex(p, d),
-        zip(*triangle(p)[:2], strict=True),
-    )
-    given = [Matrices(tuple(some), each) for some, each in zip(entries, own, strict=True)]
+    upper_d, upper_p = (tuple(zip(*triangle(size)[:2], strict=True)) for size in (d, p))
+    given = (tuple(np.ndindex(d, d)), upper_d, tuple(np.ndindex(p, d)), upper_p)
     try:
         return Loop(place, p + d, given, step)
     except (OSError, RuntimeError):
         return None
-
-
-def _loops(d: int, p: int, items: int, through: Sequence[Step]) -> dict[tuple[bool, ...], Loop]:
-    """Compiled steps of every kind that is needed; none where one does not compile, or where it does not pay."""
-    if d == 1 or not items or not pays(items * len(through), _products(d, p)):
-        return {}
-    loops = {own: compiled_step(d, p, own) for own in {step.own() for step in through}}
-    found = {own: loop for own, loop in loops.items() if loop is not None}
-    return found if len(found) == len(loops) else {}
-
-
-def _products(d: int, p: int) -> int:
-    """About how many products a step takes that is written out."""
-    return d * d * (3 * d + 1) // 2 + 2 * p * d * (d + p)
 
 
 def _heights(d: int, p: int, own: bool) -> list[int]:
