@@ -111,16 +111,19 @@ class Loop:
         steps : how many.
         out : (1, d, d, items) for the last matrices, or (steps, d, d, items), the items in one piece: filled.
         """
-        down, right = out.strides[1:3]
         words = [steps, len(start), out.strides[0] if len(out) > 1 else 0]
-        words += [out.ctypes.data + i * down + j * right for i, j in self._out]
-        words += [watched.ctypes.data + i * watched.strides[0] for i in range(len(watched))]
+        words += _addresses(out, self._out, out.strides[1:3])
+        words += _addresses(watched, [(i, 0) for i in range(len(watched))], watched.strides)
         arrays = [np.asarray(M, dtype=float) for M in (start, *given)]
         for M, entries in zip(arrays, self._read, strict=True):
-            down, right = M.strides[-2:]
-            words += [M.strides[0] if M.ndim == 3 else 0, *(M.ctypes.data + i * down + j * right for i, j in entries)]
+            words += [M.strides[0] if M.ndim == 3 else 0, *_addresses(M, entries, M.strides[-2:])]
         table = np.array(words, dtype=np.int64)
         self._run(table.ctypes.data)
+
+
+def _addresses(M: np.ndarray, entries: Entries, strides: Sequence[int]) -> list[int]:
+    address, down, right = M.ctypes.data, *strides
+    return [address + i * down + j * right for i, j in entries]
 
 
 def padded(items: int) -> int:

@@ -226,7 +226,7 @@ def _carry_compiled(
 ) -> np.ndarray:
     """Do the same as `carry` in a compiled loop, at most `EVERY` steps at a time."""
     d, p, items, each = out.shape[1], through[0].H.shape[-2], out.shape[-1], len(out) > 1
-    P = np.broadcast_to(P, (items, d, d))
+    P = np.broadcast_to(P, (items, d, d)) if P.ndim == 2 else P
     if share is not None and not (share == 1.0).all():
         P = P * share[:, None, None]
     cuts = [k for k in range(1, len(through)) if k % EVERY == 0 or through[k] is not through[k - 1]]
