@@ -22,7 +22,7 @@ from tests.cli.test_readme import CONSOLE, README, commands, files
 ROOT = Path(__file__).parents[1]
 EXTRAS = ("plot", "study", "data", "flint", "compiled")
 MOST_BYTES, MOST_SECONDS = 1_500_000, 0.25
-COMPILES = "from stochfuse.kalman.packed import compiled_step; raise SystemExit(not compiled_step(2, 1))"
+COMPILES = "from stochfuse.kalman.packed import compiled_step; raise SystemExit(not compiled_step(2, 1, True))"
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
 
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import lru_cache
 from importlib.util import find_spec
 from typing import Any
@@ -78,11 +78,14 @@ class Loop:
     place : (d, d) which of the carried numbers stands where in the matrix that a step makes anew.
     watched : how many numbers beside them a step makes anew.
     given : which entries are read of each matrix that it goes by.
+    common : which of these are never an item's own, so that they are read once.
     step : from the terms of the carried numbers, those watched and the entries of each matrix given, one-dimensional
         arrays, to what the carried numbers and those watched become.
     """
 
-    def __init__(self, place: np.ndarray, watched: int, given: Sequence[Entries], step: Step) -> None:
+    def __init__(
+        self, place: np.ndarray, watched: int, given: Sequence[Entries], common: Collection[int], step: Step
+    ) -> None:
         import llvmlite.binding as llvm
 
         llvm.initialize_native_target()
@@ -93,7 +96,7 @@ class Loop:
         first = np.unique(place, return_index=True)[1]
         self._out = list(np.ndindex(place.shape))
         self._read = [[self._out[at] for at in first], *given]
-        text = _text(place.ravel().tolist(), watched, [len(entries) for entries in self._read], step)
+        text = _text(place.ravel().tolist(), watched, [len(entries) for entries in self._read], common, step)
         self._engine: Any = llvm.create_mcjit_compiler(llvm.parse_assembly(text), machine)  # it keeps the code
         self._engine.finalize_object()
         self._run = ctypes.CFUNCTYPE(None, ctypes.c_void_p)(self._engine.get_function_address("run"))
@@ -177,7 +180,7 @@ ret void
 """The loops.  The last group is filled up with the last item, and what is beyond it is not stored."""
 
 
-def _text(place: Sequence[int], watched: int, read: Sequence[int], step: Step) -> str:
+def _text(place: Sequence[int], watched: int, read: Sequence[int], common: Collection[int], step: Step) -> str:
     """Return the loops around a step as LLVM reads them; what is in their table, `Loop.__call__` says."""
     written: dict[str, str] = {}
 
@@ -187,14 +190,15 @@ def _text(place: Sequence[int], watched: int, read: Sequence[int], step: Step) -
     now, seen = terms("now", read[0]), terms("seen", watched)
     becomes, then = step(now, seen, *(terms(f"m{j}", size) for j, size in enumerate(read[1:], start=1)))
     words = ["steps", "items", "apart", *(f"out.{i}" for i in range(len(place))), *(f"row.{i}" for i in range(watched))]
-    group, show, done = [], [], []
+    once, group, show, done = [], [], [], []
     for j, size in enumerate(read):
         words += [f"stride{j}", *(f"m{j}.{i}" for i in range(size))]
-        group += [
-            f"%one{j} = insertelement {_PLACES} poison, i64 %stride{j}, i32 0",
-            f"%each{j} = shufflevector {_PLACES} %one{j}, {_PLACES} poison, <{LANES} x i32> zeroinitializer",
-            f"%far{j} = mul {_PLACES} %item, %each{j}",
-        ]
+        if j - 1 in common:
+            for i in range(size):
+                once += [f"%number{j}.{i} = load double, ptr %in.m{j}.{i}"]
+                once += _spread(f"%m{j}.{i}", "double", f"%number{j}.{i}")
+            continue
+        group += [*_spread(f"%each{j}", "i64", f"%stride{j}"), f"%far{j} = mul {_PLACES} %item, %each{j}"]
         for i in range(size):
             group += [
                 f"%at{j}.{i} = getelementptr i8, ptr %in.m{j}.{i}, {_PLACES} %far{j}",
@@ -223,8 +227,17 @@ def _text(place: Sequence[int], watched: int, read: Sequence[int], step: Step) -
         for i, term in enumerate(after)
     ]
     body += [f"{name} = {text}" for text, name in written.items()]
-    parts = {"entry": entry, "group": group, "step": body, "show": show, "done": done}
+    parts = {"entry": entry + once, "group": group, "step": body, "show": show, "done": done}
     return _FRAME.format(**{part: "\n".join(lines) for part, lines in parts.items()})
+
+
+def _spread(name: str, kind: str, value: str) -> list[str]:
+    """Write one number into every lane."""
+    vector = f"<{LANES} x {kind}>"
+    return [
+        f"{name}.one = insertelement {vector} poison, {kind} {value}, i32 0",
+        f"{name} = shufflevector {vector} {name}.one, {vector} poison, <{LANES} x i32> zeroinitializer",
+    ]
 
 
 @lru_cache(maxsize=1)

@@ -182,10 +182,10 @@ def carry(
     """
     d, p, items = out.shape[1], through[0].H.shape[-2], out.shape[-1]
     pay = d > 1 and items > 0 and pays(items * len(through), d * d * (3 * d + 1) // 2 + 2 * p * d * (d + p))
-    loop = compiled_step(d, p) if pay else None
+    own = any(M.ndim == 3 for step in through for M in (step.F, step.H))
+    loop = compiled_step(d, p, own) if pay else None
     if loop is not None:
         return _carry_compiled(loop, P, through, out, share, unsound, after)
-    own = any(M.ndim == 3 for M in (through[0].F, through[0].H))
     heights = _heights(d, p, own)
     blocks = -(-items // max(FEWEST, CACHE // sum(heights)))
     size = max(1, -(-items // (8 * max(blocks, 1))) * 8)
@@ -257,8 +257,8 @@ def _carry_compiled(
 
 
 @lru_cache(maxsize=64)
-def compiled_step(d: int, p: int) -> Loop | None:
-    """The step of `_FilterBlock`, compiled; None where this machine compiles nothing."""
+def compiled_step(d: int, p: int, own: bool) -> Loop | None:
+    """The step of `_FilterBlock`, compiled for F and H of all or of each; None where this machine compiles nothing."""
     triangles, place = triangle(p)[2].ravel(), triangle(d)[2]
 
     def step(P: np.ndarray, seen: np.ndarray, F: np.ndarray, Q: np.ndarray, H: np.ndarray, R: np.ndarray) -> tuple:
@@ -273,7 +273,7 @@ def compiled_step(d: int, p: int) -> Loop | None:
     upper_d, upper_p = (tuple(zip(*triangle(size)[:2], strict=True)) for size in (d, p))
     given = (tuple(np.ndindex(d, d)), upper_d, tuple(np.ndindex(p, d)), upper_p)
     try:
-        return Loop(place, p + d, given, step)
+        return Loop(place, p + d, given, () if own else (0, 2), step)
     except (OSError, RuntimeError):
         return None
 
