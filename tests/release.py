@@ -20,8 +20,9 @@ from pathlib import Path
 from tests.cli.test_readme import CONSOLE, README, commands, files
 
 ROOT = Path(__file__).parents[1]
-EXTRAS = ("plot", "study", "data", "flint")
+EXTRAS = ("plot", "study", "data", "flint", "compiled")
 MOST_BYTES, MOST_SECONDS = 1_500_000, 0.25
+COMPILES = "from stochfuse.kalman.packed import compiled_step; raise SystemExit(not compiled_step(2, 1, True))"
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
 
 
@@ -77,7 +78,7 @@ def words(text: str) -> list[str]:
 
 
 def tried(programs: Path, folder: Path) -> int:
-    """Run every example of the README; return how many there were."""
+    """Run every example of the README, and compile a filter; return how many examples there were."""
     env = {**os.environ, "COLUMNS": "80", "PATH": f"{programs}{os.pathsep}{os.environ['PATH']}"}
     env.pop("PYTHONPATH", None)
     text = README.read_text(encoding="utf-8")
@@ -90,6 +91,7 @@ def tried(programs: Path, folder: Path) -> int:
     codes = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     for code in codes:
         called(programs / "python", "-c", code, env=env, cwd=folder)
+    called(programs / "python", "-W", "error", "-c", COMPILES, env=env, cwd=folder)
     return len(shown) + len(codes)
 
 

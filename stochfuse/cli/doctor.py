@@ -39,6 +39,7 @@ def _version(name: str) -> str | None:
 
 def doctor(to: Listed = Listed()) -> None:
     """Show versions, extras and threads, and what is missing with the line that installs it."""
+    from stochfuse.kalman import compiled
     from stochfuse.report.table import Report, stamped
 
     to.check()
@@ -50,11 +51,9 @@ def doctor(to: Listed = Listed()) -> None:
     threads = {name: os.environ.get(name, "not set") for name in THREADS}
     cores = os.cpu_count()
     set_to = ", ".join(f"{name} {value}" for name, value in threads.items())
-    machine = f"{platform.system()} {platform.machine()}, {cores} cores; threads of matrix products: {set_to}"
+    machine = f"{platform.system()} {platform.machine()}, {cores} cores; threads of matrix products: {set_to}; "
+    machine += f"compiled filters: {compiled.state()}"
     keys = ("package", "extra", "version", "to install")
     facts = [dict(zip(("package", "extra", "version", "install"), row, strict=True)) for row in rows]
-    to.write(
-        Report.of_rows(
-            ("What is installed", machine), keys, rows, stamped(SCHEMA, cores=cores, threads=threads, packages=facts)
-        )
-    )
+    said = stamped(SCHEMA, cores=cores, threads=threads, compiled=compiled.state(), packages=facts)
+    to.write(Report.of_rows(("What is installed", machine), keys, rows, said))

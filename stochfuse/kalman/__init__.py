@@ -2,6 +2,7 @@
 
 Doors: `kernel` (predict, update, in covariance, information and square-root form; the only copy), `packed` (its
 covariances of many filters side by side, at speed) and `metrics` (one number out of a covariance, moments of an error).
+`compiled` makes machine code of a recursion where llvmlite is installed; `packed` uses it when there is enough to do.
 `averaged_update` and `arrivals` average the update over a number of arriving measurements, (54); `algebra` is what
 differs between NumPy and SymPy; `checks` says why a matrix is no covariance.
 

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from stochfuse.kalman.packed import INDEFINITE, smallest_pivot, triangle
+
 SYMMETRY = 1e-9
 """Largest |A − Aᵀ|, in units of the standard deviations, that is taken for rounding."""
 LARGEST = 1e100
 """Largest size of a number: its square and the square's products stay within floating point."""
 MOST = 10_000_000
 """Most agents and most steps."""
-INDEFINITE = -1e-9
-"""Most negative eigenvalue, scaled to unit diagonal, that is taken for rounding of a singular matrix."""
 
 
 def shown(value: Any) -> str:
@@ -43,6 +43,8 @@ def covariance_fault(array: np.ndarray, *, definite: bool = False) -> str | None
     ----------
     definite : whether singular ones are none either.
     """
+    if array.ndim > 2 and _all_fine(array, 1e-12 if definite else INDEFINITE):
+        return None
     if not np.isfinite(array).all():
         return "a value that is not finite (NaN or infinity)"
     diagonal = np.diagonal(array, axis1=-2, axis2=-1)
@@ -53,21 +55,26 @@ def covariance_fault(array: np.ndarray, *, definite: bool = False) -> str | None
     if np.abs(scaled - np.swapaxes(scaled, -1, -2)).max(initial=0.0) > SYMMETRY:
         return "an asymmetric one"
     even = 0.5 * (scaled + np.swapaxes(scaled, -1, -2))
-    if even.ndim > 2 and _all_definite(even, 1e-12 if definite else INDEFINITE):
-        return None
     smallest = float(np.linalg.eigvalsh(even).min(initial=np.inf))
     if smallest < INDEFINITE:
         return f"an indefinite one (smallest eigenvalue, scaled to unit variances, {smallest:.3g})"
     return "a singular one" if definite and smallest <= 1e-15 else None
 
 
-def _all_definite(stack: np.ndarray, beyond: float) -> bool:
-    """Whether the eigenvalues of all matrices of a stack are larger than that: a tenth of the time they take."""
-    try:
-        np.linalg.cholesky(stack - beyond * np.eye(stack.shape[-1]))
-    except np.linalg.LinAlgError:
-        return False
-    return True
+def _all_fine(stack: np.ndarray, beyond: float) -> bool:
+    """Whether all matrices are finite and symmetric, and their eigenvalues larger than that: a tenth of the time."""
+    d = stack.shape[-1]
+    rows, columns, place = triangle(d)
+    flat = stack.reshape(-1, d * d).T
+    P, mirrored = flat[rows * d + columns], flat[columns * d + rows]
+    with np.errstate(all="ignore"):
+        variances = P[place.diagonal()]
+        if (mirrored != P).any():
+            scale = np.sqrt(np.where(variances > 0, variances, 1.0))
+            if not (np.abs(P - mirrored) <= SYMMETRY * scale[rows] * scale[columns]).all():
+                return False
+            P = 0.5 * (P + mirrored)
+        return bool((variances >= 0).all() and (smallest_pivot(P, d, -beyond) > 0).all())
 
 
 def first_fault(P: np.ndarray) -> tuple[int, str] | None:

@@ -12,18 +12,21 @@ which is (24) and (26) for the optimal gain.  That subtraction loses about log10
 share `left` of a variance.  What is left at least is read off the rows as they pass, and off the first and the last of
 them, so that no step pays for a check; filters that may have lost too much are done again in square-root form
 (`stochfuse.kalman.kernel.update_factor`).
+
+Where there is a compiler and enough to do, the same lines run compiled (`stochfuse.kalman.compiled`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from stochfuse.errors import UsageError
-from stochfuse.kalman.checks import INDEFINITE
+from stochfuse.kalman.compiled import LANES, Loop, padded, pays
 from stochfuse.kalman.kernel import Estimate, factor, from_factor, predict, predict_factor, update_factor
 
 CANCELLATION = 1e-5
@@ -34,6 +37,10 @@ FEWEST = 512
 """Filters in a block at least: a call costs as much as some hundred of them."""
 ONE_PRODUCT = 6
 """States up to which one product for all rows is less work than two for each side."""
+INDEFINITE = -1e-9
+"""Most negative eigenvalue, scaled to unit diagonal, that is taken for rounding of a singular matrix."""
+EVERY = 8
+"""Steps between two looks at what is left."""
 _TINY = 1e-300
 
 
@@ -166,7 +173,7 @@ def carry(
     out : (1, d, d, items) for the last posterior, or (steps, d, d, items) for all of them: filled.
     share : (items,) factors of P.
     unsound : (items,) set where the last covariance is not finite, or no covariance.
-    after : hears of every step of a block, from 1.
+    after : hears how many steps of a block have been done.
 
     Returns
     -------
@@ -174,7 +181,11 @@ def carry(
         (items,) smallest share of variance that is left of what was there before; at most what it is.
     """
     d, p, items = out.shape[1], through[0].H.shape[-2], out.shape[-1]
-    own = any(M.ndim == 3 for M in (through[0].F, through[0].H))
+    pay = d > 1 and items > 0 and pays(items * len(through), d * d * (3 * d + 1) // 2 + 2 * p * d * (d + p))
+    own = any(M.ndim == 3 for step in through for M in (step.F, step.H))
+    loop = compiled_step(d, p, own) if pay else None
+    if loop is not None:
+        return _carry_compiled(loop, P, through, out, share, unsound, after)
     heights = _heights(d, p, own)
     blocks = -(-items // max(FEWEST, CACHE // sum(heights)))
     size = max(1, -(-items // (8 * max(blocks, 1))) * 8)
@@ -187,7 +198,7 @@ def carry(
             arrays.append(memory[end : end + height * width].reshape(height, width))
             end += height * width
         rows = arrays[0]
-        rows[:] = upper(P[block] if P.ndim == 3 else P[None])
+        rows[:] = upper(P[block] if P.ndim == 3 else P)
         if isinstance(share, np.ndarray):
             rows *= share[block]
         held = _Scalars(rows, arrays[1]) if d == 1 else _FilterBlock(d, p, *arrays)
@@ -204,12 +215,75 @@ def carry(
     return left
 
 
+def _carry_compiled(
+    loop: Loop,
+    P: np.ndarray,
+    through: Sequence[Step],
+    out: np.ndarray,
+    share: np.ndarray | None,
+    unsound: np.ndarray | None,
+    after: Callable[[int], object],
+) -> np.ndarray:
+    """Do the same as `carry` in a compiled loop, at most `EVERY` steps at a time."""
+    d, p, items, each = out.shape[1], through[0].H.shape[-2], out.shape[-1], len(out) > 1
+    P = np.broadcast_to(P, (items, d, d)) if P.ndim == 2 else P
+    if share is not None and not (share == 1.0).all():
+        P = P * share[:, None, None]
+    cuts = [k for k in range(1, len(through)) if k % EVERY == 0 or through[k] is not through[k - 1]]
+    size = padded(min(items, max(LANES, CACHE // (d * d * (EVERY if each else 1) + d + p))))
+    left, watched, memory = np.ones(items), np.empty((p + d, size)), np.empty((EVERY if each else 0, d, d, size))
+    for first in range(0, items, size):
+        block = np.s_[first : min(first + size, items)]
+        width, now, made = block.stop - first, P[block], out[..., block]
+        watched[:] = 0.0
+        watch = _Watch(d, p, watched[:p, :width], watched[p:, :width])
+        for k, end in pairwise([0, *cuts, len(through)]):
+            step = through[k].take(block)
+            if not k or through[k] is not through[k - 1]:
+                watch.begin(step.R)
+            made = memory[: end - k, ..., :width] if each else made
+            loop(now, watched, step, end - k, made)
+            if each:
+                out[k:end, ..., block] = made
+            now = made[-1].transpose(2, 0, 1)
+            if end % EVERY == 0 or end == len(through):
+                watch.look(made[-1][triangle(d)[:2]], end)
+            after(end)
+        watch.close()
+        left[block] = watch.left
+        if unsound is not None:
+            unsound[block] = ~sound(made[-1][triangle(d)[:2]], d)
+    return left
+
+
+@lru_cache(maxsize=64)
+def compiled_step(d: int, p: int, own: bool) -> Loop | None:
+    """The step of `_FilterBlock`, compiled for F and H of all or of each; None where this machine compiles nothing."""
+    triangles, place = triangle(p)[2].ravel(), triangle(d)[2]
+
+    def step(P: np.ndarray, seen: np.ndarray, F: np.ndarray, Q: np.ndarray, H: np.ndarray, R: np.ndarray) -> tuple:
+        block = _FilterBlock(d, p, *(np.zeros((height, 1), dtype=object) for height in _heights(d, p, True)))
+        block.F, block.H = F.reshape(d, d, 1), H.reshape(p, d, 1)
+        block.P[:, 0], block.C[: len(Q), 0], block.C[-p * p :, 0] = P, Q, R[triangles]
+        block.congruences()
+        now = [*block.shown[:, 0], *block.prior[block.diagonal, 0]]
+        block.correct()
+        return block.P[:, 0], [new.largest(before) for new, before in zip(now, seen, strict=True)]
+
+    upper_d, upper_p = (tuple(zip(*triangle(size)[:2], strict=True)) for size in (d, p))
+    given = (tuple(np.ndindex(d, d)), upper_d, tuple(np.ndindex(p, d)), upper_p)
+    try:
+        return Loop(place, p + d, given, () if own else (0, 2), step)
+    except (OSError, RuntimeError):
+        return None
+
+
 def _heights(d: int, p: int, own: bool) -> list[int]:
     """Rows of the arrays that a block works with: P, the prior's, constants, products, and two of passing use."""
     n = d * (d + 1) // 2
     whole = n + p * d + p * p
     full = 2 * d * d if own or d > ONE_PRODUCT else 0
-    return [n, whole, whole, n, max(full, (p - 1) * max(d, p), 1), p * d + 2 * p]
+    return [n, whole, whole, n, max(full, (p - 1) * max(d, p), 1), p * d + 2 * p + d]
 
 
 def _aligned(size: int) -> np.ndarray:
@@ -219,85 +293,109 @@ def _aligned(size: int) -> np.ndarray:
     return memory[first : first + size]
 
 
+class _Watch:
+    """How much of the variances of a block of filters is left.
+
+    Parameters
+    ----------
+    d, p : numbers of states and of measurements.
+    most : (p, width) for the largest S_ii while the noise stays the same, zero.
+    peak : (d, width) for the largest prior variances, zero.
+    """
+
+    def __init__(self, d: int, p: int, most: np.ndarray, peak: np.ndarray) -> None:
+        self.d, self.p, self.most, self.peak = d, p, most, peak
+        self.left, self.R = np.ones(peak.shape[1]), np.empty((0, 0))
+
+    def begin(self, R: np.ndarray) -> None:
+        """Steps with the noise R are to come."""
+        self.close()
+        self.R = upper(R)
+
+    def look(self, P: np.ndarray, steps: int) -> None:
+        """Look at the upper triangles after all steps so far.
+
+        Digits are lost by degrees, too: to a variance far below its peak, or in a P that is nearly singular.
+        """
+        kept = (P[triangle(self.d)[2].diagonal()] + _TINY) / (self.peak + _TINY)
+        self.left = np.minimum(self.left, np.minimum.reduce(kept))
+        if steps >= EVERY:
+            self.left = np.minimum(self.left, smallest_pivot(P, self.d))
+
+    def close(self) -> None:
+        """Account for the updates since the noise was laid out: 1/(1 + s) of the largest s is left, or more.
+
+        s ≤ Σ (S_ii − R_ii)/R_ii where the noises are independent; where they are not, it grows as R is singular.
+        """
+        if not len(self.R):
+            return
+        gained = np.add.reduce(self.most / self.R[triangle(self.p)[2].diagonal()]) - self.p
+        left = 1.0 if self.p == 1 else smallest_pivot(self.R, self.p)
+        self.left, self.R = np.minimum(self.left, left / (1.0 + gained)), self.R[:0]
+        self.most[:] = 0.0
+
+
 class _FilterBlock:
     """A block of filters with several states, and the memory that it works in."""
 
     def __init__(
-        self,
-        d: int,
-        p: int,
-        P: np.ndarray,
-        X: np.ndarray,
-        C: np.ndarray,
-        T: np.ndarray,
-        V: np.ndarray,
-        U: np.ndarray,
+        self, d: int, p: int, P: np.ndarray, X: np.ndarray, C: np.ndarray, T: np.ndarray, V: np.ndarray, U: np.ndarray
     ) -> None:
-        n = len(P)
+        n, width = P.shape
         self.d, self.p, self.P, self.X, self.C, self.T, self.V = d, p, P, X, C, T, V
-        width = P.shape[1]
         self.prior, self.S = X[:n], X[n + p * d :].reshape(p, p, width)
         self.W, self.U = X[n : n + p * d].reshape(p, d, width), U[: p * d].reshape(p, d, width)
-        self.turn, self.most, self.shown = U[p * d : p * d + p], U[p * d + p :], X[n + p * d :: p + 1]
+        self.turn, self.shown = U[p * d : p * d + p], X[n + p * d :: p + 1]
         self.diagonal = triangle(d)[2].diagonal()
-        self.peak, self.left, self.R = np.empty(0), np.ones(width), None
-        self.most[:] = 0.0
+        U[p * d + p :] = 0.0
+        self.watch = _Watch(d, p, U[p * d + p : p * d + 2 * p], U[p * d + 2 * p :])
+
+    @property
+    def left(self) -> np.ndarray:
+        """Smallest share of variance that is left, (width,)."""
+        return self.watch.left
 
     def prepare(self, step: Step) -> None:
         """Lay out what the steps to come go by."""
         F, Q, H, R = step
         d, p, n = self.d, self.p, len(self.P)
-        self.step, self.one = step, d <= ONE_PRODUCT and F.ndim == H.ndim == 2
+        self.one = d <= ONE_PRODUCT and F.ndim == H.ndim == 2
         if self.one:
             self.matrix, noise = _maps(F.tobytes(), H.tobytes(), d)
             np.matmul(noise, Q.reshape(-1, d * d).T, out=self.C if Q.ndim == 3 else self.C[:, :1])
         else:
-            self.C[:n] = upper(Q if Q.ndim == 3 else Q[None])
+            self.C[:n] = upper(Q)
             self.F, self.H = (M if M.ndim == 2 else np.ascontiguousarray(M.transpose(1, 2, 0)) for M in (F, H))
             self.C[n:] = 0.0
         if self.one and Q.ndim == 2:
             self.C[:, 1:] = self.C[:, :1]
-        self._close()
-        self.R = upper(R if R.ndim == 3 else R[None])
-        self.C[n + p * d :] += self.R if p == 1 else self.R[triangle(p)[2].ravel()]
+        self.watch.begin(R)
+        self.C[n + p * d :] += self.watch.R[triangle(p)[2].ravel()]
 
     def advance(self, k: int, last: bool) -> None:
-        """Predict and update, the k-th time."""
-        X, prior, S, W, U = self.X, self.prior, self.S, self.W, self.U
+        """Predict and update, the k-th time, counted from 0."""
         if self.one:
-            np.matmul(self.matrix, self.P, out=X)
-            np.add(X, self.C, out=X)
+            np.matmul(self.matrix, self.P, out=self.X)
+            np.add(self.X, self.C, out=self.X)
         else:
-            self._congruences()
-        if k % 8 == 0:
-            now = prior[self.diagonal]
-            self.peak = np.maximum(self.peak, now) if k else now
-        np.maximum(self.most, self.shown, out=self.most)
-        _eliminate(S, W, self.turn, self.V)
-        np.multiply(W, self.turn[:, None], out=U)
-        subtract(prior, U, W, self.T, self.P)
-        if last or k % 8 == 7:
-            # digits are lost by degrees, too: to a variance far below its peak, or in a P that is nearly singular
-            kept = (self.P[self.diagonal] + _TINY) / (self.peak + _TINY)
-            self.left = np.minimum(self.left, np.minimum.reduce(kept))
-            if k >= 7:
-                self.left = np.minimum(self.left, smallest_pivot(self.P, self.d))
+            self.congruences()
+        watch = self.watch
+        if k % EVERY == 0:
+            np.maximum(watch.peak, self.prior[self.diagonal], out=watch.peak)
+        np.maximum(watch.most, self.shown, out=watch.most)
+        self.correct()
+        if last or (k + 1) % EVERY == 0:
+            watch.look(self.P, k + 1)
         if last:
-            self._close()
+            watch.close()
 
-    def _close(self) -> None:
-        """Account for the updates since the noise was laid out: 1/(1 + s) of the largest s is left, or more.
+    def correct(self) -> None:
+        """P from P⁻, H P⁻ and S."""
+        _eliminate(self.S, self.W, self.turn, self.V)
+        np.multiply(self.W, self.turn[:, None], out=self.U)
+        subtract(self.prior, self.U, self.W, self.T, self.P)
 
-        s ≤ Σ (S_ii − R_ii)/R_ii where the noises are independent; where they are not, it grows as R is singular.
-        """
-        if self.R is None:
-            return
-        gained = np.add.reduce(self.most / self.R[triangle(self.p)[2].diagonal()]) - self.p
-        left = 1.0 if self.p == 1 else smallest_pivot(self.R, self.p)
-        self.left, self.R = np.minimum(self.left, left / (1.0 + gained)), None
-        self.most[:] = 0.0
-
-    def _congruences(self) -> None:
+    def congruences(self) -> None:
         """F P Fᵀ + Q, H P⁻ and H P⁻Hᵀ + R from both sides, one after the other."""
         d, p, n, F, H = self.d, self.p, len(self.P), self.F, self.H
         full, moved = (M.reshape(d, d, -1) for M in np.split(self.V[: 2 * d * d], 2))

@@ -1,9 +1,10 @@
 """Covariance recursions of many filters with noises of their own, against what others write for one thread.
 
-`python -m tests.benchmarks.kernel [--quick] [--most FILTERS]`.  Every way gets the noises in the layout that suits it, goes through five
-steps of predict and update, and returns the last covariances; answers must agree with the literal stacks.  JAX and Numba
-(extra `bench`) compile before they are timed; one that is not installed is named and left out.  Times are CPU time, the
-ways in turns, so that other work on the machine hits all alike; the lower quartile is shown.
+`python -m tests.benchmarks.kernel [--quick] [--most FILTERS]`.  Every way gets the noises in the layout that suits it, goes
+through five steps of predict and update, and returns the last covariances; answers must agree with the literal stacks.  JAX
+and Numba (extra `bench`) compile before they are timed, and so do our filters (extra `compiled`), at every size unless
+STOCHFUSE_COMPILED=0; what is not installed is named and left out.  Times are CPU time, the ways in turns, so that other work
+on the machine hits all alike; the lower quartile is shown.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import stochfuse as sf
+from stochfuse.kalman.compiled import SWITCH
 from tests.oracles import textbook
 
 STEPS = 5
@@ -241,7 +243,19 @@ def numba_ways(given: Work) -> dict[str, Run]:
 def ours(given: Work) -> dict[str, Run]:
     """The kernel; and, where filters share F and H, the batch of scenarios of one agent, with its checks."""
     F, H, Q, R, P0 = given
-    ways: dict[str, Run] = {OURS: lambda: sf.kalman.covariances(P0, F, Q, H, R, STEPS)}
+
+    def run() -> np.ndarray:
+        return sf.kalman.covariances(P0, F, Q, H, R, STEPS)
+
+    def by_numpy() -> np.ndarray:
+        before = os.environ.get(SWITCH, "")
+        os.environ[SWITCH] = "0"
+        try:
+            return run()
+        finally:
+            os.environ[SWITCH] = before
+
+    ways: dict[str, Run] = {OURS: run, "stochfuse, the same by NumPy alone": by_numpy}
     if not given.own:
         model = {"F": F.tolist(), "H": H.tolist(), "Q": Q[0].tolist(), "R": R[0].tolist()}
         network = {"agents": 1, "steps": STEPS + 1, "link": 0.0}  # step 1 is the exchange of first estimates
@@ -297,7 +311,7 @@ def sizes(quick: bool, most: int) -> list[tuple[str, ...]]:
 
 def absent() -> list[str]:
     """Which compilers are not installed."""
-    return [name for name in ("jax", "numba") if importlib.util.find_spec(name) is None]
+    return [name for name in ("jax", "numba", "llvmlite") if importlib.util.find_spec(name) is None]
 
 
 def main() -> None:
@@ -324,6 +338,6 @@ if __name__ == "__main__":
         os.execve(
             sys.executable,
             [sys.executable, "-m", "tests.benchmarks.kernel", *sys.argv[1:]],
-            {**os.environ, **dict.fromkeys(THREADS, "1"), "XLA_FLAGS": flags},
+            {**os.environ, **dict.fromkeys(THREADS, "1"), "XLA_FLAGS": flags, SWITCH: os.environ.get(SWITCH, "1")},
         )
     main()
