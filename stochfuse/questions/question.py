@@ -22,7 +22,7 @@ from stochfuse.prediction.quantities import noun
 from stochfuse.prediction.result import Prediction
 from stochfuse.prediction.swept import Swept
 from stochfuse.scenario.over import Over
-from stochfuse.scenario.registry import CHAIN, METHODS, MONTE_CARLO, OPTIMAL, SIMPLIFIED
+from stochfuse.scenario.registry import CHAIN, METHODS, MONTE_CARLO, NO_CONTROL, OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.scenario import Scenario
 
 SLACK = 8 * np.finfo(float).eps
@@ -52,17 +52,21 @@ class Question:
 
     def predict(self, link: Any) -> Prediction:
         """Return the prediction at some links."""
-        more = {"steady": True} if self.step is None else {}
-        found = predict_(self.scenario, link, self.method, self.quantity, **more, **self.settings)
+        found = predict_(self.scenario, link, self.method, self.quantity, **self._more)
         _not_sampled([found])
         return found
 
     def sweep(self, link: Any, over: Over) -> Swept:
         """Return the predictions of what was swept at some links."""
-        more = {"steady": True} if self.step is None else {}
-        found = predict_(self.scenario, link, self.method, self.quantity, over=over, **more, **self.settings)
+        found = predict_(self.scenario, link, self.method, self.quantity, over=over, **self._more)
         _not_sampled(found.parts)
         return found
+
+    @property
+    def _more(self) -> dict[str, Any]:
+        # two runs tell that it would be a sample
+        few = {"runs": 2, "workers": 1, "control": NO_CONTROL} if self.method == OPTIMAL else {}
+        return {**few, **self.settings} | ({"steady": True} if self.step is None else {})
 
     def read(self, prediction: Prediction, agent: int | str | None = None) -> np.ndarray:
         """Return the number asked for in every row of a prediction, shape (links,)."""
@@ -97,7 +101,8 @@ def _not_sampled(predictions: Sequence[Prediction]) -> None:
     if any(p.sampled is not None for p in predictions):
         raise UsageError(
             "method optimal: the optimum of so many unlike agents or links is sampled, and what is asked backwards of "
-            f"it would follow the sample's errors: expected a contact chain of at most {MOST_STATES} states"
+            f"it would follow the sample's errors: expected a contact chain of at most {MOST_STATES} states, or method "
+            "simplified"
         )
 
 
