@@ -12,7 +12,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextvars import ContextVar
 from functools import wraps
-from math import floor, inf, isfinite, log10
+from math import inf, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_type_hints
 
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from stochfuse.scenario.over import Over
     from stochfuse.scenario.scenario import Scenario
 
-MOST_LINKS = 1_000_000
 SCENARIO, NETWORK, SHOWN, WORK, OUTPUT = "Scenario", "Network", "What is shown", "How it is worked out", "Output"
 RARE = ", rarely used"
 """Ends a panel whose options `--help` leaves to `--help-all`."""
@@ -550,7 +549,9 @@ def parse_link(text: str) -> list[float]:
     UsageError
         If the text is none of these or a value is no probability.
     """
-    values = [float(value) for value in _numbers("--link", text, 0.0, 1.0)]
+    from stochfuse.scenario.over import numbers_of
+
+    values = [float(value) for value in numbers_of("--link", text, 0.0, 1.0)]
     for value in values:
         if not 0 <= value <= 1:
             raise UsageError(f"--link: expected probabilities between 0 and 1, got {value:g}")
@@ -565,7 +566,7 @@ def over_values(texts: Sequence[str]) -> dict[str, list[float]]:
     UsageError
         If a text is malformed, there are more than two, or a key is named twice.
     """
-    from stochfuse.scenario.over import MOST_KEYS
+    from stochfuse.scenario.over import MOST_KEYS, numbers_of
 
     if len(texts) > MOST_KEYS:
         raise UsageError(f"--over: expected it once or twice, got it {len(texts)} times; for more see stochfuse study")
@@ -574,7 +575,7 @@ def over_values(texts: Sequence[str]) -> dict[str, list[float]]:
         key, spec = _key_and(text, "KEY=SPEC such as network.delay=0:3:1 or model.R=50,100")
         if key in found:
             raise UsageError(f"--over: expected different keys, got {key} twice")
-        found[key] = _numbers(f"--over {key}", spec)
+        found[key] = numbers_of(f"--over {key}", spec)
         if not all(map(isfinite, found[key])):
             raise UsageError(f"--over {key}: expected finite numbers, got '{spec}'")
     return found
@@ -588,12 +589,14 @@ def over_ends(texts: Sequence[str]) -> tuple[str, tuple[float, float]]:
     UsageError
         If the text is malformed, or there are several.
     """
+    from stochfuse.scenario.over import number
+
     if len(texts) > 1:
         raise UsageError(f"--over: expected it once with --target, got it {len(texts)} times")
     expected = "KEY=LO:HI such as model.R=50:200"
     key, spec = _key_and(texts[0], expected)
     try:
-        low, high = map(_number, spec.split(":"))
+        low, high = map(number, spec.split(":"))
     except ValueError:
         raise UsageError(f"--over: expected {expected}, got '{texts[0]}'") from None
     if not -inf < low < high < inf:
@@ -606,47 +609,6 @@ def _key_and(text: str, expected: str) -> tuple[str, str]:
     if not key or not spec:
         raise UsageError(f"--over: expected {expected}, got '{text}'")
     return key, spec
-
-
-def _numbers(flag: str, text: str, low: float = -inf, high: float = inf) -> list[float]:
-    """Numbers of `0.5`, `0.2,0.5` or `0:1:0.25` (both ends included); whole where all that is written is whole."""
-    values: list[float] = []
-    for part in text.split(","):
-        try:
-            numbers = [_number(piece) for piece in part.split(":")]
-        except ValueError:
-            numbers = []
-        if len(numbers) == 1:
-            values += numbers
-        elif len(numbers) == 3:
-            values += _range(flag, text, (numbers[0], numbers[1], numbers[2]), low, high)
-        else:
-            raise UsageError(f"{flag}: expected 0.5, 0.2,0.5 or 0:1:0.25, got '{text}'")
-    return values
-
-
-def _number(text: str) -> float:
-    try:
-        return int(text)
-    except ValueError:
-        return float(text)
-
-
-def _range(flag: str, text: str, ends: tuple[float, float, float], low: float, high: float) -> list[float]:
-    first, last, step = ends
-    if not (step > 0 and last >= first and first >= low and last <= high and isfinite(last - first)):
-        bounds = f"{low:g} ≤ first ≤ last ≤ {high:g}" if isfinite(low) else "first ≤ last"
-        raise UsageError(f"{flag}: expected first:last:step with {bounds} and step > 0, got '{text}'")
-    count = (last - first) / step
-    if count > MOST_LINKS:
-        what = "link probabilities" if flag == "--link" else "values"
-        raise UsageError(f"{flag}: expected at most {MOST_LINKS} {what}, got {count:.3g} from '{text}'")
-    if all(isinstance(number, int) for number in ends):
-        return [*range(int(first), int(last), int(step)), last]
-    # twelve digits of the largest, so that 0.3 is called 0.3
-    decimals = 12 - floor(log10(max(abs(first), abs(last), step)))
-    values = [round(first + i * step, decimals) for i in range(int(count + 1e-9) + 1)]
-    return values if values[-1] >= last - 0.1**decimals else [*values, last]
 
 
 def write_report(report: Report, kind: str, output: Path | None) -> None:
