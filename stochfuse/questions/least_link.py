@@ -456,7 +456,7 @@ def _monotone(asked: Question) -> Expectation:
     value, rounding, sections = asked.at, ROUNDING, SECTIONS
     if asked.step is None:
         rounding = STEADY_ROUNDING
-        if len(asked.scenario.sensors) > 1:
+        if len(asked.scenario.sensors) > 1 or asked.method == OPTIMAL:
             # where no steady state exists it takes long to find that out: one point at a time
             value, sections = remembered(partial(_where_steady, asked, [-1.0])), 2
     elif asked.method == OPTIMAL:

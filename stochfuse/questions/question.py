@@ -98,7 +98,8 @@ class Question:
 
 def _not_sampled(predictions: Sequence[Prediction]) -> None:
     """Raise UsageError where the optimum is sampled, of agents of which a chain would have too many states."""
-    if any(p.sampled is not None for p in predictions):
+    found = [*predictions, *(p.limit.prediction for p in predictions if p.limit is not None)]
+    if any(p.sampled is not None for p in found):
         raise UsageError(
             "method optimal: the optimum of so many unlike agents or links is sampled, and what is asked backwards of "
             f"it would follow the sample's errors: expected a contact chain of at most {MOST_STATES} states, or method "
@@ -124,7 +125,7 @@ def question(
     ----------
     scenario : from `load_scenario`.
     step : the step asked about; default: the last.
-    steady : ask about the steady state instead (simplified).
+    steady : ask about the steady state instead (of the simplified formulation, or of the optimum).
     method, quantity, **settings : see `stochfuse.predict`; every method but "monte-carlo".
     of : name of the metric; default: the scenario's, else trace.
     agent : "mean", "worst", "best" or a number from 1.
@@ -145,8 +146,6 @@ def question(
         )
     if steady and step is not None:
         raise UsageError(f"step: expected none with the steady state, got {step}")
-    if steady and method != SIMPLIFIED:
-        raise UsageError(f"steady: expected method simplified, got {method}")
     if step is not None and not 1 <= step <= last:
         raise UsageError(f"step: expected a number from 1 to {last} (network.steps), got {step}")
     bursts = scenario.network.burst, *scenario.network.case_bursts
@@ -158,6 +157,11 @@ def question(
     at = None if steady else step or last
     if quantity == OPTIMAL or (method, quantity) == (OPTIMAL, "claimed"):
         method = quantity = OPTIMAL  # the optimum is the same whatever the method
+    if steady and method not in (SIMPLIFIED, OPTIMAL):
+        raise UsageError(
+            f"steady: expected method {SIMPLIFIED} or {OPTIMAL}, whose steady states are enclosed, got {method}, whose "
+            "steady states are sampled: predict --steady shows them"
+        )
     return Question(scenario.until(at or 1), at, chosen, agent, method, quantity, settings)
 
 

@@ -129,7 +129,7 @@ def sensitivity(
     alike = len(scenario.sensors) == 1 and len(np.unique(µ)) == 1 and asked_for.agent == "mean"
     alike = alike and network.hears is None
     exact = asked_for.method != SIMPLIFIED and linear(asked_for.quantity, asked_for.metric)
-    exact = exact and asked_for.quantity != "bias"
+    exact = exact and asked_for.quantity != "bias" and asked_for.step is not None
     degree = asked_for.scenario.network.steps * (len(µ) if alike else 1) + SPARE
     exact = exact and degree <= MOST_DEGREE
     degree = degree if exact else SHORT_DEGREE
