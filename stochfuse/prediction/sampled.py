@@ -468,6 +468,7 @@ def _drawn(
 ) -> Sample:
     """Draw outcomes, and keep what is claimed in them, moments of the errors, or estimates given measurements."""
     network, rows = system.network, len(links.link)
+    how = replace(how, shown=ShownPart())  # metrics do not travel to other processes
     steps = range(1, network.steps + 1)
     drawn = [events(network, links, step) for step in (steps if links.varies else steps[:1])]
     experiment = Experiment(

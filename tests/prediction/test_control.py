@@ -222,6 +222,13 @@ def test_the_same_arrivals_for_more_agents_than_words_have_bits():
     np.testing.assert_allclose(found.P[0, :, 0, :, 0, 0], 100 / heard, rtol=1e-12)
 
 
+def test_what_is_shown_does_not_depend_on_the_number_of_processes():
+    scenario = sf.load_scenario("thesis-transient", steps=2)
+    shown = ShownPart(metrics=(metric("rms:x", scenario.model),))
+    one, two = (drawn(scenario, [0.3, 0.7], runs=600, workers=w, shown=shown).values("rms:x") for w in (1, 2))
+    np.testing.assert_allclose(two, one, rtol=1e-12)
+
+
 def test_a_control_is_asked_for_by_name():
     with pytest.raises(sf.UsageError, match="control: expected one of optimum, none, got 'antithetic'"):
         drawn(small(), [0.5], control="antithetic")
