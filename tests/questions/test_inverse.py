@@ -441,6 +441,18 @@ def test_a_link_that_is_not_heard_is_none():
     assert {(i, j) for i, (j,) in sensitivity(s).links} == {(2, 1), (1, 2), (3, 2), (2, 3)}
 
 
+@pytest.mark.slow
+def test_the_steady_optimum_asked_backwards():
+    """Against what the contact chain gives after so many steps that the first no longer matter."""
+    found = least_link(thesis(steps=2), 30.0, steady=True, method="optimal")
+    late = sf.predict(thesis(steps=8), [found.link], "optimal").values()[0]
+    assert late[-1] == pytest.approx(30.0, rel=1e-4)
+    assert abs(late[-1] - 30.0) < abs(late[-3] - 30.0)
+    assert found.enclosure[1] - found.enclosure[0] < 1e-8
+    slope = sensitivity(thesis(), found.link, steady=True, method="optimal").derivative.sum()
+    assert slope == pytest.approx((found.above - found.below) / 2e-9, rel=1e-4)
+
+
 def test_where_several_are_the_worst_no_single_link_helps():
     found = sensitivity(thesis(), 0.5, agent="worst")
     assert found.first == ()
@@ -535,7 +547,7 @@ MATRIX = [[0, 0.5, 0.5], [0.5, 0, 0.5], [0.5, 0.5, 0]]
         (lambda: least_link(thesis(case=[{"name": "a", "link": 0.5}]), 20.0), "or none, got network.case"),
         (lambda: least_link(thesis(), 20.0, step=6), r"step: expected a number from 1 to 5 \(network.steps\), got 6"),
         (lambda: least_link(thesis(), 20.0, step=2, steady=True), "step: expected none with the steady state, got 2"),
-        (lambda: least_link(thesis(), 20.0, steady=True, method="general"), "steady: expected method simplified, got general"),
+        (lambda: least_link(thesis(), 20.0, steady=True, method="general"), "steady: expected method simplified or optimal, whose steady states are enclosed, got general"),
         (lambda: least_link(thesis(), 20.0, method="monte-carlo"), "got monte-carlo: its values are sampled"),
         (lambda: least_link(thesis(), 20.0, method="best"), "method: expected one of simplified, general.* got 'best'"),
         (lambda: least_link(thesis(), 20.0, of="area"), "metric: expected trace.* got 'area'"),
