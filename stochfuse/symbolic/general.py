@@ -167,8 +167,8 @@ class GeneralForm:
     def _enumerated(self) -> tuple[Ledger, dict[int, list[Any]], int]:
         """Ledger, weight by number of arrivals of every value claimed at the step, and number of links L."""
         network = Network(self.agents, self.step, self.architecture, None)
-        check_size(network)
         rows, kinds = uniform_rows([0.5]), (0,) * self.agents
+        check_size(network, rows)
         # footprints only say whose noise is whose
         labels = kinds if self.quantity == CLAIMED else tuple(range(self.agents))
         permutations = relabellings(network, rows, kinds)
