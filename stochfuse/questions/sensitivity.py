@@ -34,10 +34,12 @@ from stochfuse.errors import NoAnswerError, StochfuseError, UsageError
 from stochfuse.prediction.quantities import linear
 from stochfuse.prediction.result import Prediction
 from stochfuse.questions.question import Question, described, question
+from stochfuse.scenario.checker import Checker
 from stochfuse.scenario.network import LinkRows, reachable, uniform_rows
 from stochfuse.scenario.registry import OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.result import Result
 from stochfuse.scenario.scenario import Scenario, of_scenario
+from stochfuse.scenario.tables import read_link
 
 MOST_UPDATES = 200_000_000
 """Updates (rows of links, agents, steps and, of unlike sensors, numbers of arrivals) that are worth the time."""
@@ -166,38 +168,27 @@ def sensitivity(
 
 def _links(scenario: Scenario, link: Any, case: str | None) -> np.ndarray:
     """Link probabilities µ_ij(k) as they are, (steps or 1, n, n)."""
-    network = scenario.network
-    chosen = link
-    if link is None:
-        chosen = network.link if case is None else _case(dict(network.cases), case)
+    network, check = scenario.network, Checker()
+    if link is None and case is not None:
+        cases = dict(network.cases)
+        if case not in cases:
+            names = ", ".join(f"'{known}'" for known in cases)
+            expected = f"one of {names}" if cases else "none, as the scenario has no cases"
+            raise UsageError(f"case: expected {expected}, got '{case}'")
+        chosen = cases[case]
+    elif link is None:
+        chosen = network.link
         if chosen is None:
             more = ", nor the name of a case" if network.cases else ""
             raise UsageError(f"sensitivity: expected links to start from, got none here nor in network.link{more}")
     elif case is not None:
         raise UsageError(f"case: expected none beside link probabilities of one's own, got '{case}'")
-    n, steps = network.agents, network.steps
-    try:
-        array = np.asarray(chosen, dtype=float)
-    except (TypeError, ValueError):
-        raise UsageError(f"link: expected a probability or a {n}×{n} matrix, got {link!r}") from None
-    if array.shape not in ((), (n, n), (steps,), (steps, n, n)):
-        raise UsageError(
-            f"link: expected a probability or a {n}×{n} matrix, or {steps} of either, one per step; got an array of "
-            f"shape {array.shape}"
-        )
-    if not ((array >= 0) & (array <= 1)).all():
-        raise UsageError(f"link: expected probabilities between 0 and 1, got {array.min():g} to {array.max():g}")
-    if array.shape == (steps,):
-        array = array[:, None, None]
-    return np.broadcast_to(array, (len(array) if array.ndim == 3 else 1, n, n))
-
-
-def _case(cases: dict[str, np.ndarray], name: str) -> np.ndarray:
-    if name not in cases:
-        names = ", ".join(f"'{known}'" for known in cases)
-        expected = f"one of {names}" if cases else "none, as the scenario has no cases"
-        raise UsageError(f"case: expected {expected}, got '{name}'")
-    return cases[name]
+    else:
+        chosen = read_link(check, "link", link, network.agents, network.steps, network.architecture)
+        if chosen is None or check.problems:
+            raise UsageError("; ".join(map(str, check.problems)))
+    full = chosen[..., None, None] if chosen.ndim < 2 else chosen
+    return np.broadcast_to(full, (len(full) if full.ndim == 3 else 1, network.agents, network.agents))
 
 
 def chebyshev_points(degree: int) -> np.ndarray:
