@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from math import floor, inf, isfinite, log10
+from math import inf, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +19,6 @@ from stochfuse.scenario.registry import GENERAL, MONTE_CARLO, NAIVE, OPTIMAL, QU
 if TYPE_CHECKING:
     from stochfuse.scenario.scenario import Scenario
 
-MOST_LINKS = 1_000_000
 
 
 def named(text: str) -> tuple[str, ...]:
@@ -242,7 +241,9 @@ def parse_link(text: str) -> list[float]:
     UsageError
         If the text is none of these or a value is no probability.
     """
-    values = [float(value) for value in _numbers("--link", text, 0.0, 1.0)]
+    from stochfuse.scenario.over import numbers_of
+
+    values = [float(value) for value in numbers_of("--link", text, 0.0, 1.0)]
     for value in values:
         if not 0 <= value <= 1:
             raise UsageError(f"--link: expected probabilities between 0 and 1, got {value:g}")
@@ -257,14 +258,14 @@ def over_values(texts: Sequence[str]) -> dict[str, list[float]]:
     UsageError
         If a text is malformed, there are more than two, or a key is named twice.
     """
-    from stochfuse.scenario.over import MOST_KEYS
+    from stochfuse.scenario.over import MOST_KEYS, numbers_of
 
     if len(texts) > MOST_KEYS:
         raise UsageError(f"--over: expected it once or twice, got it {len(texts)} times; for more see stochfuse study")
     found: dict[str, list[float]] = {}
     expected = "KEY=SPEC such as network.delay=0:3:1 or model.R=50,100"
     for key, spec in named_once("--over", texts, expected, "different keys").items():
-        found[key] = _numbers(f"--over {key}", spec)
+        found[key] = numbers_of(f"--over {key}", spec)
         if not all(map(isfinite, found[key])):
             raise UsageError(f"--over {key}: expected finite numbers, got '{spec}'")
     return found
@@ -278,55 +279,16 @@ def over_ends(texts: Sequence[str]) -> tuple[str, tuple[float, float]]:
     UsageError
         If the text is malformed, or there are several.
     """
+    from stochfuse.scenario.over import number
+
     if len(texts) > 1:
         raise UsageError(f"--over: expected it once with --target, got it {len(texts)} times")
     expected = "KEY=LO:HI such as model.R=50:200"
     ((key, spec),) = named_once("--over", texts, expected, "one").items()
     try:
-        low, high = map(_number, spec.split(":"))
+        low, high = map(number, spec.split(":"))
     except ValueError:
         raise UsageError(f"--over: expected {expected}, got '{texts[0]}'") from None
     if not -inf < low < high < inf:
         raise UsageError(f"--over {key}: expected LO:HI with LO < HI, got '{spec}'")
     return key, (low, high)
-
-
-def _numbers(flag: str, text: str, low: float = -inf, high: float = inf) -> list[float]:
-    """Numbers of `0.5`, `0.2,0.5` or `0:1:0.25` (both ends included); whole where all that is written is whole."""
-    values: list[float] = []
-    for part in text.split(","):
-        try:
-            numbers = [_number(piece) for piece in part.split(":")]
-        except ValueError:
-            numbers = []
-        if len(numbers) == 1:
-            values += numbers
-        elif len(numbers) == 3:
-            values += _range(flag, text, (numbers[0], numbers[1], numbers[2]), low, high)
-        else:
-            raise UsageError(f"{flag}: expected 0.5, 0.2,0.5 or 0:1:0.25, got '{text}'")
-    return values
-
-
-def _number(text: str) -> float:
-    try:
-        return int(text)
-    except ValueError:
-        return float(text)
-
-
-def _range(flag: str, text: str, ends: tuple[float, float, float], low: float, high: float) -> list[float]:
-    first, last, step = ends
-    if not (step > 0 and last >= first and first >= low and last <= high and isfinite(last - first)):
-        bounds = f"{low:g} ≤ first ≤ last ≤ {high:g}" if isfinite(low) else "first ≤ last"
-        raise UsageError(f"{flag}: expected first:last:step with {bounds} and step > 0, got '{text}'")
-    count = (last - first) / step
-    if count > MOST_LINKS:
-        what = "link probabilities" if flag == "--link" else "values"
-        raise UsageError(f"{flag}: expected at most {MOST_LINKS} {what}, got {count:.3g} from '{text}'")
-    if all(isinstance(number, int) for number in ends):
-        return [*range(int(first), int(last), int(step)), last]
-    # twelve digits of the largest, so that 0.3 is called 0.3
-    decimals = 12 - floor(log10(max(abs(first), abs(last), step)))
-    values = [round(first + i * step, decimals) for i in range(int(count + 1e-9) + 1)]
-    return values if values[-1] >= last - 0.1**decimals else [*values, last]

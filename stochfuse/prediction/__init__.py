@@ -1,9 +1,14 @@
 """From a scenario to a prediction: estimator × engine → expected covariance and what it means.
 
-Doors: `predict.predict`, `predict_several`, `predict_many`; `compare`; `states.predict_states`.  `simplified`
-(50)–(54), `general` (44)–(49), `optimal` and `sampled` are the methods: each takes a system and items and gives
-`method.Averaged`; `result.Prediction` is what users hold, `quantities` what can be shown of it, `steady_state` the
-recursion's fixed point, `boundedness` whether there is one.
+    predict          `predict`, `predict_several`, `predict_many`: one request, any method; `swept`: against any number
+    simplified, general, optimal, sampled     the methods: a system and items in, `method.Averaged` out
+    control, stopping                         what a sample does with the optimum beside it, and when it may stop
+    states, expected_states                   estimates given what was measured: (53), and of any method
+    limits           the steady state of any prediction; of (54) `steady_state`, of the optimum `steady_chain`
+    boundedness      whether (54) has one
+    compare          methods, or estimators, side by side
+    interval         what a log leaves unknown of its links, carried on
+    result, quantities                        what users hold, and what can be shown of it
 
 It knows the rooms below.  A new method is one file with a function `averaged`, and its entry in the registry.
 """

@@ -52,8 +52,8 @@ from stochfuse.scenario.system import Items, Noises, System
 
 MOST_PROBABILITIES = 20_000_000
 """Probabilities that a distribution may hold at a time."""
-MOST_LINKED, MOST_SENDERS = 40, 12
-"""Agents, and agents that one of them may hear, up to which outcomes are listed."""
+MOST_SENDERS, MOST_DRAWN = 12, 1000
+"""Agents that one of them may hear in a step, and links in all, up to which outcomes are listed."""
 KEPT = 8
 """Structures kept for what is asked next."""
 HELD = 1 << 24
@@ -611,7 +611,7 @@ def _enumerated(
 ) -> Enumerated:
     """Enumerate all outcomes; parameters and errors are those of `outcomes`."""
     network = system.network
-    check_size(network)
+    check_size(network, links)
     # records tell like agents apart
     kinds = kinds_of(system, how.estimator) if records is None else tuple(range(network.agents))
     permutations = relabellings(network, links, kinds)
@@ -764,11 +764,15 @@ def groups_alike(
     return tuple(orbits(network.agents, permutations))
 
 
-def check_size(network: Network) -> None:
+def check_size(network: Network, links: LinkRows) -> None:
     """Raise TooManyError if what the agents may hear at one step is too much to list."""
-    n, senders = network.agents, number_of_senders(network.architecture, network.agents)
-    if senders > MOST_SENDERS or n > MOST_LINKED:
-        drawn = n if network.architecture == "broadcast" else n * senders
+    n = network.agents
+    heard = np.full(n, number_of_senders(network.architecture, n))
+    if not links.uniform:
+        steps = range(1, network.steps + 1 if links.varies else 2)
+        heard = np.max([(links.matrices(network, step) > 0).any(axis=0).sum(axis=1) for step in steps], axis=0)
+    drawn = n if network.architecture == "broadcast" else heard.sum()
+    if heard.max() > MOST_SENDERS or drawn > MOST_DRAWN:
         raise TooManyError(
             f"one exchange of {n} agents, {network.architecture}, has 2^{drawn} outcomes, too many "
             "to go through: use --method optimal or --method monte-carlo"

@@ -18,6 +18,7 @@ of the sample at that step is that of the steady state.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from dataclasses import fields, replace
 from itertools import product
@@ -34,7 +35,7 @@ from stochfuse.engines.contact_chain import (
 )
 from stochfuse.engines.enclosure import ROUNDING, enclosed, half_width
 from stochfuse.engines.precision import PROMISED
-from stochfuse.engines.progress import listener
+from stochfuse.engines.progress import listener, within
 from stochfuse.errors import NoAnswerError, ScenarioError, StochfuseError, UsageError
 from stochfuse.kalman.metrics import Moments
 from stochfuse.prediction import optimal
@@ -298,9 +299,13 @@ def _by_sampling(prediction: Prediction, rows: LinkRows, period: int, how: Setti
     scenario, wanted = prediction.scenario, _Wanted(prediction, rows, period)
     few = replace(how, runs=min(how.runs, PILOT))
     share, settled = np.sqrt(few.runs / how.runs), None
+    takes = ""
     for steps in _doubling(period):
         one, other = _two(prolonged(scenario, steps))
-        near = wanted.at(one, few)
+        began = time.monotonic()
+        with within(f"burn-in of {steps} steps{takes}", 1, 2):
+            near = wanted.at(one, few)
+        takes = f"; the sample takes {(time.monotonic() - began) * how.runs / few.runs:.0f} s or more"
         if settled is not None and wanted.apart(near, settled[1], 1.0) <= MOVED:
             at, _, gap = settled
             note = (
@@ -308,8 +313,11 @@ def _by_sampling(prediction: Prediction, rows: LinkRows, period: int, how: Setti
                 f"P(k0)/{FAR:g} and from {FAR:g} P(k0), differ there by at most {gap:.1g} standard errors"
             )
             cycle = f"the limit is a cycle of {period} steps, of which the mean is shown"
-            return Limit(wanted.at(prolonged(scenario, at), how), period, None, (note, *[cycle] * (period > 1)))
-        gap = wanted.apart(near, wanted.at(other, few), share)
+            with within(f"sample at step {at}{takes}", 1, 1):
+                found = wanted.at(prolonged(scenario, at), how)
+            return Limit(found, period, None, (note, *[cycle] * (period > 1)))
+        with within(f"burn-in of {steps} steps{takes}", 2, 2):
+            gap = wanted.apart(near, wanted.at(other, few), share)
         settled = (steps, near, gap) if gap <= CLOSE else None
     raise NoAnswerError(
         f"no steady state: within {MOST_STEPS} steps two samples of the same arrivals that start far apart do not "

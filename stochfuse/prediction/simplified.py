@@ -392,8 +392,8 @@ def _outcomes(system: System, shared: bool, own: int, sender_kinds: np.ndarray, 
     number = int(np.prod([n + 1.0 for n in most]))
     if number > MOST_OUTCOMES:
         raise UsageError(
-            f"unlike agents make {number} sets of senders to average over (at most {MOST_OUTCOMES} are evaluated); "
-            "give fewer kinds of sensors"
+            f"method simplified: unlike agents make {number} sets of senders to average over (at most {MOST_OUTCOMES} "
+            "are evaluated); give fewer kinds of sensors, or --method monte-carlo, which draws them"
         )
     counts = np.array(list(product(*(range(n + 1) for n in most))))
     weights, seen = [], {}

@@ -6,15 +6,16 @@ With P_m one update with m + 1 measurements, the consistent (53) is
 
 for one record z(k) that stands for what every agent measured, as (53) has it.  Agents with records of their own average
 over the sets S of senders, x̂_i(k) = Σ_S µ_S µ_¬S update(prior_i; z_i and z_j, j ∈ S), with agent i's prior in the place
-of the common one.  The printed (53) puts the averaged P(k) in front of the sum; its bias is erratum 1 (see
-`stochfuse.prediction.simplified`).
+of the common one.  m measurements of one kind of sensor are their mean with R/m, and x̂ is linear in it: in the place of
+2^(n−1) sets the numbers m of each kind are gone through, with the mean of what arrives given m.  The printed (53) puts
+the averaged P(k) in front of the sum; its bias is erratum 1 (see `stochfuse.prediction.simplified`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import chain, combinations
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,8 +46,6 @@ SELF_CONSISTENT = (
     "the simplified formulation takes for granted that agents share the broadcast prior and nothing else: by its own "
     "assumptions the actual covariance is the claimed one; for what is true see method general"
 )
-MOST_AGENTS = 12
-"""Agents up to which records of their own are averaged over all sets of senders."""
 
 
 class States(NamedTuple):
@@ -79,8 +78,8 @@ def predict_states(
     Parameters
     ----------
     scenario : the scenario; its initial.x is the estimate at step 1.
-    measurements : (steps, p): one record that stands for every agent's; or (steps, agents, p): each agent's own, for at
-        most 12 agents.  The entry of step 1 is not used: nothing is measured before the first exchange.
+    measurements : (steps, p): one record that stands for every agent's; or (steps, agents, p): each agent's own.  The
+        entry of step 1 is not used: nothing is measured before the first exchange.
     link : link probabilities, one row each; default: those of the scenario.
     printed : evaluate (53) as the thesis prints it, with P(k) in front of the sum (one record only).
 
@@ -122,8 +121,7 @@ def predict_states(
         raise UsageError("(53) as printed takes one record for all agents, of shape (steps, p)")
     else:
         own = np.broadcast_to(z[:, None], (len(z), n, z.shape[-1])) if z.ndim == 2 else z
-        blank = np.zeros(1)
-        x = _own_records(system, rows, [[r if s else blank for r, s in zip(now, sees, strict=True)] for now in own])
+        x = _own_records(system, rows, np.where((sees > 0)[:, None], own, 0.0))
     return States(rows.means(scenario.network), np.arange(1, steps + 1), x[..., 0], scenario.model.states)
 
 
@@ -142,11 +140,6 @@ def mean_error(system: System, rows: LinkRows) -> np.ndarray:
 
     An error obeys the equations of an estimate in a world whose state is zero: b(k) = (I − K̄H) F b(k−1) for like
     agents.
-
-    Raises
-    ------
-    UsageError
-        If unlike agents are too many to average over all sets of senders.
     """
     steps, n, d = system.network.steps, system.network.agents, system.model.dimension
     if system.error is None:
@@ -155,7 +148,7 @@ def mean_error(system: System, rows: LinkRows) -> np.ndarray:
     widths = [sensor.H.shape[-2] for sensor in system.sensors]
     if len(widths) == 1:
         return _one_record(still, rows, np.zeros((steps, widths[0])), printed=False)
-    return _own_records(still, rows, [[np.zeros(widths[kind]) for kind in system.sensor_of]] * steps)
+    return _own_records(still, rows, np.zeros((steps, n, max(widths))))
 
 
 def _one_record(system: System, rows: LinkRows, z: np.ndarray, printed: bool) -> np.ndarray:
@@ -203,55 +196,69 @@ def _printed(prior: Estimate, sensor: Sensor, arrivals: Arrivals, z: np.ndarray,
     return P @ (before.y + measured * (local.y - before.y))
 
 
-def _own_records(system: System, rows: LinkRows, z: Sequence[Sequence[np.ndarray]] | np.ndarray) -> np.ndarray:
-    network, d = system.network, system.model.dimension
-    if network.agents > MOST_AGENTS:
-        raise UsageError(
-            f"records of each agent's own are averaged over all sets of senders, for at most {MOST_AGENTS} agents; "
-            f"got {network.agents}. Give one record of shape (steps, p)"
-        )
+def _own_records(system: System, rows: LinkRows, z: np.ndarray) -> np.ndarray:
+    """Expected estimates (rows, steps, agents, d, 1) from each agent's own record, (steps, agents, p)."""
+    n, steps = system.agents, system.steps
     P, group_of = _covariances(system, rows)
-    senders = simplified.measuring(system)
-    x = [np.broadcast_to(system.x0, (len(rows.link), d, 1))] * network.agents
-    out = [np.stack(x, axis=1)]
-    for step in range(2, network.steps + 1):
+    senders, own = simplified.measuring(system), np.arange(n)[:, None]
+    heard_own = np.ones((len(rows.link), n, 1))
+    if system.detects is None:
+        senders = np.concatenate([senders, own], axis=1)
+    kinds = np.asarray(system.sensor_of)[senders]
+    x = np.broadcast_to(system.x0, (len(rows.link), n, *system.x0.shape))
+    out = [x]
+    for step in range(2, steps + 1):
         heard = simplified.measured(system, rows, step)
-        kinds = [sensor.at(step) for sensor in system.sensors]
-        sensors = [(kinds[kind].H, kinds[kind].R) for kind in system.sensor_of]
-        x = [
-            _over_subsets(
-                _prior(system, x[i], P[:, step - 2, group_of[i]], step),
-                () if system.detects is not None else (i,),
-                senders[i],
-                heard[:, i],
-                sensors,
-                z[step - 1],
+        if system.detects is None:
+            heard = np.concatenate([heard, heard_own], axis=2)
+        arrived = [
+            (
+                sensor.at(step),
+                *_arrived(np.where(kinds == kind, heard, 0.0), z[step - 1, :, : sensor.H.shape[-2]][senders]),
             )
-            for i in range(network.agents)
+            for kind, sensor in enumerate(system.sensors)
+            if sensor.H.any()
         ]
-        out.append(np.stack(x, axis=1))
+        x = _over_counts(_prior(system, x, P[:, step - 2, group_of], step), arrived)
+        out.append(x)
     return np.stack(out, axis=1)
 
 
-def _over_subsets(
-    prior: Estimate,
-    certain: Sequence[int],
-    senders: np.ndarray,
-    heard: np.ndarray,
-    sensors: list[tuple[np.ndarray, np.ndarray]],
-    z: Sequence[np.ndarray] | np.ndarray,
-) -> np.ndarray:
+def _arrived(heard: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Probability that m = 0, 1 … measurements arrive, (m, rows, agents), and their mean given m, (…, p, 1).
+
+    Parameters
+    ----------
+    heard, z : how likely each measurement arrives, (rows, agents, senders), and what it is, (agents, senders, p).
+    """
+    most = int((heard > 0).sum(axis=2).max())
+    probability, total = np.zeros((most + 1, *heard.shape[:2])), np.zeros((most + 1, *heard.shape[:2], z.shape[-1]))
+    probability[0] = 1.0
+    for µ, value in zip(np.moveaxis(heard, 2, 0), np.moveaxis(z, 1, 0), strict=True):
+        # one more: with probability µ, and then it adds to what the others were
+        more, others = µ * probability[:-1], µ[..., None] * total[:-1]
+        probability *= 1.0 - µ
+        total *= 1.0 - µ[..., None]
+        total[1:] += others + more[..., None] * value
+        probability[1:] += more
+    numbers = np.arange(most + 1).reshape(-1, 1, 1) * probability
+    mean = np.divide(total, numbers[..., None], out=np.zeros_like(total), where=numbers[..., None] > 0)
+    return probability, mean[..., None]
+
+
+def _over_counts(prior: Estimate, arrived: Sequence[tuple[Sensor, np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Σ over how many measurements of each kind arrive: linear in them, an estimate needs their mean alone."""
     total, start = np.zeros_like(prior.x), factor(prior.P)
-    places = range(len(senders))
-    for subset in chain.from_iterable(combinations(places, m) for m in range(len(senders) + 1)):
-        inside = np.isin(places, subset)
+    for counts in product(*(range(len(probability)) for _, probability, _ in arrived)):
+        weight = np.prod([p[m] for m, (_, p, _) in zip(counts, arrived, strict=True)], axis=0)
+        if not np.any(weight):
+            continue
         x, L = prior.x, start
-        for j in (*certain, *senders[inside]):
-            # one measurement after the other, so that precise sensors lose nothing
-            H, R = sensors[j]
-            L = update_factor(L, H, R)
-            x = x + posterior_gain(L, H, R) @ (z[j][:, None] - H @ x)
-        total = total + np.where(inside, heard, 1.0 - heard).prod(axis=1)[:, None, None] * x
+        for m, (sensor, _, mean) in zip(counts, arrived, strict=True):
+            if m:  # one kind after the other, so that precise sensors lose nothing
+                L = update_factor(L, sensor.H, sensor.R / m)
+                x = x + posterior_gain(L, sensor.H, sensor.R / m) @ (mean[m] - sensor.H @ x)
+        total = total + np.asarray(weight)[..., None, None] * x
     return total
 
 

@@ -26,7 +26,6 @@ from stochfuse.scenario.scenario import Scenario
 
 T = TypeVar("T")
 Answer = TypeVar("Answer")
-_NATURES: list[str] = list(NATURES)
 
 
 def _to(first: str, last: str) -> str:
@@ -148,7 +147,7 @@ class Swept(SweptRows[Prediction]):
     @property
     def nature(self) -> str:
         """Nature of the least certain point."""
-        return max((part.nature for part in self.parts), key=_NATURES.index)
+        return max((part.nature for part in self.parts), key=NATURES.index)
 
     @property
     def notes(self) -> tuple[str, ...]:

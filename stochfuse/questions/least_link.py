@@ -1,33 +1,24 @@
-"""Where a function on [0, 1] is at most a target: every interval, its ends narrowed down to rounding.
+"""A question asked backwards: the least link probability that meets a target.
 
-[0, 1] is cut into cells in which the function f crosses the target at most once (`separated` for polynomials, by proof;
-`scanned` for anything else, by looking closely); every crossing is then narrowed down between a point that misses the
-target and one that meets it, so that each end found meets the target itself.
-
-A polynomial is given in Bernstein's form, f(µ) = Σ b_c C(L, c) µ^c (1−µ)^(L−c): by Descartes' rule of signs it has at
-most as many roots in the cell as the b_c have changes of sign, and de Casteljau's halving gives the b_c of both halves.
-
-(54) in fifty digits, for a least link probability that the rounding of double precision leaves uncertain.
-
-Where a curve is so flat that rounding moves its crossing of the target by more than is wanted, the crossing is found
-again with the same equations over mpmath's numbers: `stochfuse.kalman.kernel` and `stochfuse.prediction.simplified`
-as they are, numbers of `DIGITS` digits in the place of elements of a field.
-
-A question asked backwards: the least link probability that meets a target.
-
-With E(µ) the number asked about (a metric of a quantity, at a step or in the steady state), one µ for all links:
+With E(µ) the number asked about (a metric of a quantity, at a step or in the steady state), one µ for all links,
 
     least µ          µ* = min {µ in [0, 1] : E(µ) ≤ target}
 
 E need not fall throughout (an RMS error with an initial bias first rises), so that µ* is not simply "the" root: every
-interval in which the target is met is found (`stochfuse.questions.least_link`), and where the first one begins is the
-answer.
-Why no smaller µ meets the target comes with it:
+interval in which the target is met is found, and where the first one begins is the answer.  [0, 1] is cut into cells in
+which E crosses the target at most once; every crossing is then narrowed down between a point that misses the target and
+one that meets it, so that each end found meets the target itself.  Why no smaller µ meets it comes with the cells:
 
 * `monotone`: (54) and the optimum average, over a number of measurements that grows with µ (and with n) in
   probability, a covariance that falls with that number, through time updates that keep the order; so E falls.
-* `polynomial`: one enumeration gives E = Σ A_c µ^c (1−µ)^(L−c), whose roots are parted by their changes of sign.
+* `polynomial`: one enumeration gives E = Σ A_c µ^c (1−µ)^(L−c).  In Bernstein's form E has, by Descartes' rule of
+  signs, at most as many roots in a cell as its coefficients have changes of sign there, and de Casteljau's halving
+  gives the coefficients of both halves, until the roots are parted.
 * `scan`: anything else is looked at closely.
+
+Where a curve is so flat that rounding moves its crossing by more than is wanted, the crossing of (54) is found again
+with the same equations over mpmath's numbers: `stochfuse.kalman.kernel` and `stochfuse.prediction.simplified` as they
+are, numbers of `DIGITS` digits in the place of elements of a field.
 """
 
 from __future__ import annotations
@@ -456,7 +447,7 @@ def _monotone(asked: Question) -> Expectation:
     value, rounding, sections = asked.at, ROUNDING, SECTIONS
     if asked.step is None:
         rounding = STEADY_ROUNDING
-        if len(asked.scenario.sensors) > 1:
+        if len(asked.scenario.sensors) > 1 or asked.method == OPTIMAL:
             # where no steady state exists it takes long to find that out: one point at a time
             value, sections = remembered(partial(_where_steady, asked, [-1.0])), 2
     elif asked.method == OPTIMAL:

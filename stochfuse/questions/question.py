@@ -22,7 +22,7 @@ from stochfuse.prediction.quantities import noun
 from stochfuse.prediction.result import Prediction
 from stochfuse.prediction.swept import Swept
 from stochfuse.scenario.over import Over
-from stochfuse.scenario.registry import CHAIN, METHODS, MONTE_CARLO, OPTIMAL, SIMPLIFIED
+from stochfuse.scenario.registry import CHAIN, METHODS, MONTE_CARLO, NO_CONTROL, OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.scenario import Scenario
 
 SLACK = 8 * np.finfo(float).eps
@@ -52,17 +52,21 @@ class Question:
 
     def predict(self, link: Any) -> Prediction:
         """Return the prediction at some links."""
-        more = {"steady": True} if self.step is None else {}
-        found = predict_(self.scenario, link, self.method, self.quantity, **more, **self.settings)
+        found = predict_(self.scenario, link, self.method, self.quantity, **self._more)
         _not_sampled([found])
         return found
 
     def sweep(self, link: Any, over: Over) -> Swept:
         """Return the predictions of what was swept at some links."""
-        more = {"steady": True} if self.step is None else {}
-        found = predict_(self.scenario, link, self.method, self.quantity, over=over, **more, **self.settings)
+        found = predict_(self.scenario, link, self.method, self.quantity, over=over, **self._more)
         _not_sampled(found.parts)
         return found
+
+    @property
+    def _more(self) -> dict[str, Any]:
+        # two runs tell that it would be a sample
+        few = {"runs": 2, "workers": 1, "control": NO_CONTROL} if self.method == OPTIMAL else {}
+        return {**few, **self.settings} | ({"steady": True} if self.step is None else {})
 
     def read(self, prediction: Prediction, agent: int | str | None = None) -> np.ndarray:
         """Return the number asked for in every row of a prediction, shape (links,)."""
@@ -94,10 +98,12 @@ class Question:
 
 def _not_sampled(predictions: Sequence[Prediction]) -> None:
     """Raise UsageError where the optimum is sampled, of agents of which a chain would have too many states."""
-    if any(p.sampled is not None for p in predictions):
+    found = [*predictions, *(p.limit.prediction for p in predictions if p.limit is not None)]
+    if any(p.sampled is not None for p in found):
         raise UsageError(
             "method optimal: the optimum of so many unlike agents or links is sampled, and what is asked backwards of "
-            f"it would follow the sample's errors: expected a contact chain of at most {MOST_STATES} states"
+            f"it would follow the sample's errors: expected a contact chain of at most {MOST_STATES} states, or method "
+            "simplified"
         )
 
 
@@ -119,7 +125,7 @@ def question(
     ----------
     scenario : from `load_scenario`.
     step : the step asked about; default: the last.
-    steady : ask about the steady state instead (simplified).
+    steady : ask about the steady state instead (of the simplified formulation, or of the optimum).
     method, quantity, **settings : see `stochfuse.predict`; every method but "monte-carlo".
     of : name of the metric; default: the scenario's, else trace.
     agent : "mean", "worst", "best" or a number from 1.
@@ -140,8 +146,6 @@ def question(
         )
     if steady and step is not None:
         raise UsageError(f"step: expected none with the steady state, got {step}")
-    if steady and method != SIMPLIFIED:
-        raise UsageError(f"steady: expected method simplified, got {method}")
     if step is not None and not 1 <= step <= last:
         raise UsageError(f"step: expected a number from 1 to {last} (network.steps), got {step}")
     bursts = scenario.network.burst, *scenario.network.case_bursts
@@ -153,6 +157,11 @@ def question(
     at = None if steady else step or last
     if quantity == OPTIMAL or (method, quantity) == (OPTIMAL, "claimed"):
         method = quantity = OPTIMAL  # the optimum is the same whatever the method
+    if steady and method not in (SIMPLIFIED, OPTIMAL):
+        raise UsageError(
+            f"steady: expected method {SIMPLIFIED} or {OPTIMAL}, whose steady states are enclosed, got {method}, whose "
+            "steady states are sampled: predict --steady shows them"
+        )
     return Question(scenario.until(at or 1), at, chosen, agent, method, quantity, settings)
 
 

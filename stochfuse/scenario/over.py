@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cached_property
 from itertools import product
-from math import isfinite
+from math import floor, inf, isfinite, log10
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -34,6 +34,49 @@ _LIKELIHOODS = ("link", "burst", "radio")
 """Keys of [network] that say how likely messages are."""
 MOST_KEYS, MOST_POINTS = 2, 10_000
 """What is swept at once; for more there are studies."""
+MOST_LINKS = 1_000_000
+
+
+def numbers_of(flag: str, text: str, low: float = -inf, high: float = inf) -> list[float]:
+    """Numbers of `0.5`, `0.2,0.5` or `0:1:0.25` (both ends included); whole where all that is written is whole."""
+    values: list[float] = []
+    for part in text.split(","):
+        try:
+            numbers = [number(piece) for piece in part.split(":")]
+        except ValueError:
+            numbers = []
+        if len(numbers) == 1:
+            values += numbers
+        elif len(numbers) == 3:
+            values += _range(flag, text, (numbers[0], numbers[1], numbers[2]), low, high)
+        else:
+            raise UsageError(f"{flag}: expected 0.5, 0.2,0.5 or 0:1:0.25, got '{text}'")
+    return values
+
+
+def number(text: str) -> float:
+    """A number, whole where it is written so."""
+    try:
+        return int(text)
+    except ValueError:
+        return float(text)
+
+
+def _range(flag: str, text: str, ends: tuple[float, float, float], low: float, high: float) -> list[float]:
+    first, last, step = ends
+    if not (step > 0 and last >= first and first >= low and last <= high and isfinite(last - first)):
+        bounds = f"{low:g} ≤ first ≤ last ≤ {high:g}" if isfinite(low) else "first ≤ last"
+        raise UsageError(f"{flag}: expected first:last:step with {bounds} and step > 0, got '{text}'")
+    count = (last - first) / step
+    if count > MOST_LINKS:
+        what = "link probabilities" if flag == "--link" else "values"
+        raise UsageError(f"{flag}: expected at most {MOST_LINKS} {what}, got {count:.3g} from '{text}'")
+    if all(isinstance(number, int) for number in ends):
+        return [*range(int(first), int(last), int(step)), last]
+    # twelve digits of the largest, so that 0.3 is called 0.3
+    decimals = 12 - floor(log10(max(abs(first), abs(last), step)))
+    values = [round(first + i * step, decimals) for i in range(int(count + 1e-9) + 1)]
+    return values if values[-1] >= last - 0.1**decimals else [*values, last]
 
 
 def put(mapping: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:

@@ -16,13 +16,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import ConfigDict, Field, Strict
 
+from stochfuse.errors import UsageError
 from stochfuse.kalman.checks import LARGEST, shown
 from stochfuse.kalman.metrics import Metric
 from stochfuse.kalman.metrics import metric as metric_of
 from stochfuse.prediction.quantities import noun
 from stochfuse.prediction.quantities import unit as unit_of
 from stochfuse.scenario.checker import Checker
-from stochfuse.scenario.over import put
+from stochfuse.scenario.over import numbers_of, put
 from stochfuse.scenario.registry import (
     CONTROLS,
     CRITERIA,
@@ -110,7 +111,9 @@ class StudyFile(StrictTable):
     schema_: Literal["stochfuse.study/1"] = Field("stochfuse.study/1", alias="schema")
     description: str | None = None
     scenario: str | dict[str, Any] = Field("thesis-transient", description="preset, file (seen from here), or table")
-    vary: dict[str, Any] = Field(description="what differs: lists of values, or {from, to, number}, by their keys")
+    vary: dict[str, Any] = Field(
+        description="what differs: lists of values, '0:1:0.25', or {from, to, number}, by their keys"
+    )
     design: DesignTable = Field(default_factory=lambda: DesignTable.model_validate({}))
     predict: PredictTable = Field(default_factory=lambda: PredictTable.model_validate({}))
     report: StudyReportTable = Field(default_factory=lambda: StudyReportTable.model_validate({}))
@@ -206,6 +209,12 @@ def _flattened(vary: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any
 
 def _axis(check: Checker, name: str, value: Any, kind: str) -> Axis | None:
     path = f"vary.{name}"
+    if isinstance(value, str) and ":" in value:
+        try:
+            value = numbers_of(path, value)
+        except UsageError as error:
+            check.note(path, *str(error).removeprefix(f"{path}: expected ").rsplit(", got ", 1))
+            return None
     if isinstance(value, list):
         if not value:
             check.note(path, "at least one value", "an empty list")
@@ -219,7 +228,7 @@ def _axis(check: Checker, name: str, value: Any, kind: str) -> Axis | None:
             return None
         return Axis(name, tuple(value))
     if not isinstance(value, dict):
-        check.note(path, "a list of values, or {from, to, number}", shown(value))
+        check.note(path, "a list of values, '0:1:0.25', or {from, to, number}", shown(value))
         return None
     problems = problems_of(RangeTable, value)
     for problem in problems:

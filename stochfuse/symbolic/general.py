@@ -167,8 +167,8 @@ class GeneralForm:
     def _enumerated(self) -> tuple[Ledger, dict[int, list[Any]], int]:
         """Ledger, weight by number of arrivals of every value claimed at the step, and number of links L."""
         network = Network(self.agents, self.step, self.architecture, None)
-        check_size(network)
         rows, kinds = uniform_rows([0.5]), (0,) * self.agents
+        check_size(network, rows)
         # footprints only say whose noise is whose
         labels = kinds if self.quantity == CLAIMED else tuple(range(self.agents))
         permutations = relabellings(network, rows, kinds)
@@ -197,7 +197,10 @@ class GeneralForm:
                 for cell, factor in enumerate(factor_of):
                     parts = [(int(ids[index[cell]]), sign) for sign, index in view.terms]
                     value = ledger.combine(ending.step, [(v, sign) for v, sign in parts if v >= 0])
-                    both = _product(_product(_exact(weight), _exact(factor)), [self._share(s) for s in share])
+                    both = np.convolve(
+                        np.convolve(_exact(weight), _exact(factor)),
+                        np.array([self._share(s) for s in share], dtype=object),
+                    )
                     known = found.setdefault(value, [sympy.S.Zero] * (ending.events + 1))
                     self._check_number(len(found) if self.quantity == CLAIMED else len(found) // self.agents)
                     for c, a in enumerate(_completed(both, ending.events)):
@@ -310,23 +313,14 @@ def derive_general(
     return GeneralForm(agents, step, architecture, *numbers, shared=correlation == "shared", estimator=estimator)
 
 
-def _exact(coefficients: np.ndarray) -> list[sympy.Integer]:
-    return [sympy.Integer(round(a)) for a in coefficients]
+def _exact(coefficients: np.ndarray) -> np.ndarray:
+    return np.array([sympy.Integer(round(a)) for a in coefficients], dtype=object)
 
 
-def _product(a: list[Any], b: list[Any]) -> list[Any]:
-    out = [sympy.S.Zero] * (len(a) + len(b) - 1)
-    for i, x in enumerate(a):
-        if x:
-            for j, y in enumerate(b):
-                out[i + j] += x * y
-    return out
-
-
-def _completed(coefficients: list[Any], degree: int) -> list[Any]:
+def _completed(coefficients: np.ndarray, degree: int) -> np.ndarray:
     """Coefficients with events that do not matter counted in."""
     free = degree + 1 - len(coefficients)
-    return _product(coefficients, [sympy.binomial(free, c) for c in range(free + 1)])
+    return np.convolve(coefficients, np.array([sympy.binomial(free, c) for c in range(free + 1)], dtype=object))
 
 
 def _polynomial(coefficients: list[Any]) -> sympy.Poly:

@@ -302,6 +302,18 @@ def test_exactly_as_many_graphs_as_are_allowed():
         sf.predict(sf.load_scenario(steps=3), [0.5], method="general", max_graphs=14)
 
 
+def test_many_agents_of_whom_few_are_linked():
+    """The linked ones as if they were alone, the others as if they heard nobody."""
+    link = np.zeros((45, 45))
+    link[:4, :4] = [[0, 0.3, 0, 0.8], [0, 0, 0.6, 0], [0.5, 0, 0, 0], [0, 0.2, 0, 0]]
+    many, few = (
+        sf.predict(sf.load_scenario(agents=n, steps=3), [link[:n, :n]], method="general").by_group for n in (45, 4)
+    )
+    np.testing.assert_allclose(many[:, :, :4], few, rtol=1e-12)
+    alone = sf.predict(sf.load_scenario(agents=1, steps=3), method="general").by_group
+    np.testing.assert_allclose(many[0, :, 4], alone[0, :, 0], rtol=1e-12)
+
+
 def test_more_than_seven_agents():
     """Too many to look for relabellings, and alike all the same; step 1 in closed form."""
     p = sf.predict(sf.load_scenario(agents=9, steps=1), [0.3], method="general")

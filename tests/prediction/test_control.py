@@ -107,8 +107,8 @@ CASES = {
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_it_is_unbiased_and_its_error_is_honest(case):
-    """z-scores of 400 samples against the enumeration; of more runs where what is left is rare and skewed."""
-    runs = 800 if case in ("graph", "burst", "detections") else 400
+    """z-scores of 400 samples of 400 runs against the enumeration."""
+    runs = 400
     scenario, link, estimator = CASES[case]
     exact = sf.predict(scenario, link, "general", "rms", estimator=estimator)
     found = drawn(
@@ -220,6 +220,13 @@ def test_the_same_arrivals_for_more_agents_than_words_have_bits():
     for event, fate in zip(happens, fates.T, strict=True):
         heard[:, event.receivers[0]] += fate
     np.testing.assert_allclose(found.P[0, :, 0, :, 0, 0], 100 / heard, rtol=1e-12)
+
+
+def test_what_is_shown_does_not_depend_on_the_number_of_processes():
+    scenario = sf.load_scenario("thesis-transient", steps=2)
+    shown = ShownPart(metrics=(metric("rms:x", scenario.model),))
+    one, two = (drawn(scenario, [0.3, 0.7], runs=600, workers=w, shown=shown).values("rms:x") for w in (1, 2))
+    np.testing.assert_allclose(two, one, rtol=1e-12)
 
 
 def test_a_control_is_asked_for_by_name():

@@ -7,6 +7,7 @@ import pytest
 import sympy
 
 import stochfuse as sf
+from tests.agreement.test_detection import with_detection
 from tests.oracles import textbook
 from tests.oracles.strategies import mapping, model
 
@@ -184,10 +185,29 @@ def test_records_that_do_not_fit(z, options, message):
         sf.predict_states(sf.Scenario.from_mapping(source), z, **options)
 
 
-def test_too_many_own_records_and_a_singular_prior_are_refused():
-    source, *_ = setup(agents=13)
-    with pytest.raises(sf.UsageError, match="for at most 12 agents; got 13"):
-        sf.predict_states(sf.Scenario.from_mapping(source), np.zeros((STEPS, 13, 1)))
+@pytest.mark.parametrize("detection", [1.0, 0.7])
+def test_own_records_of_many_agents(detection):
+    """Twenty agents with two kinds of sensor, against 1,500 drawn sets of senders."""
+    source, (F, Q, H, R, _), x0, rng = setup(7, 2, 1, 20)
+    n, agent = 20, 7
+    links, z = rng.uniform(size=(n, n)), rng.normal(size=(2, n, 1))
+    source["network"] |= {"link": links.tolist(), "steps": 2}
+    noises = [float(R[0, 0]) * (1 + 3 * (i % 2)) for i in range(n)]
+    source["agent"] = [{"R": r} for r in noises]
+    s = sf.Scenario.from_mapping(source)
+    s = s if detection == 1.0 else with_detection(s, [detection] * n)
+    got = sf.predict_states(s, z).x[0, 1, agent]
+    prior = textbook.kalman_predict(sf.predict(s).of_agent(agent + 1)[0, 0], F, Q)
+    drawn = []
+    for arrives in rng.uniform(size=(1500, n)) < detection * np.where(np.arange(n) == agent, 1.0, links[agent]):
+        Y = np.linalg.inv(prior) + sum(H.T @ H / noises[j] for j in np.flatnonzero(arrives))
+        y = np.linalg.solve(prior, F @ x0) + sum(H.T @ z[1, j][:, None] / noises[j] for j in np.flatnonzero(arrives))
+        drawn.append(np.linalg.solve(Y, y)[:, 0])
+    off = np.abs(np.mean(drawn, axis=0) - got) / (np.std(drawn, axis=0) / np.sqrt(1500))
+    assert off.max() < 4.5
+
+
+def test_a_singular_prior_is_refused_as_printed():
     singular = mapping(1.0, 0.0, 1.0, 1.0, 0.0)
     with pytest.raises(sf.UsageError, match=r"\(53\) as printed needs an invertible prior covariance"):
         sf.predict_states(sf.Scenario.from_mapping(singular), np.zeros((4, 1)), printed=True)

@@ -23,6 +23,7 @@ from stochfuse.questions.least_link import intervals, least_link, remembered, sc
 from stochfuse.questions.question import question
 from stochfuse.questions.sensitivity import sensitivity, share_of_gain
 from stochfuse.report.solutions import sensitivity_sheet
+from stochfuse.scenario.network import LinkRows
 from tests.oracles import textbook
 from tests.oracles.strategies import mapping, model
 
@@ -395,6 +396,63 @@ def test_steady_sensitivities():
     assert found.derivative[1] == 0.0
 
 
+PER_STEP = [[[0, 0.3], [1.0, 0]], [[0, 0.9], [0.0, 0]], [[0, 0.02], [0.5, 0]]]
+
+
+def test_exact_sensitivities_of_links_per_step():
+    """E is affine in each µ_ij(k): its derivatives are differences of E at 1 and 0, summed over the steps."""
+    s = thesis(agents=2, steps=3, link=PER_STEP)
+    found = sensitivity(s, method="general")
+    assert found.exact
+    np.testing.assert_allclose(found.link, [np.mean([0.3, 0.9, 0.02]), 0.5], rtol=1e-12)
+    for (sender, (receiver,)), slope in zip(found.links, found.derivative, strict=True):
+        wanted = 0.0
+        for k in range(3):
+            ends = np.tile(np.array(PER_STEP), (2, 1, 1, 1))
+            ends[:, k, receiver - 1, sender - 1] = [0.0, 1.0]
+            wanted += float(np.diff(sf.predict(s, LinkRows(None, ends), "general").values()[:, -1])[0])
+        assert slope == pytest.approx(wanted, rel=1e-9)
+
+
+def test_simplified_sensitivities_of_twenty_agents_and_of_links_per_step():
+    """Against differences of `predict`, the link moved in all steps at once, as far as it can be."""
+    n, h = 20, 1e-4
+    link = np.random.default_rng(4).uniform(0.05, 0.95, size=(3, n, n))
+    link[0, 3, 4], link[1, 3, 4] = 0.0, 1.0  # no room to move all
+    sensors = [{"R": 100.0 + 300.0 * (i % 2)} for i in range(n)]
+    s = scenario(1.0, 25.0, 1.0, 100.0, 100.0, agents=n, steps=3, sensors=sensors, link=link.tolist())
+    found = sensitivity(s, of="std:x")
+    assert len(found.links) == n * (n - 1)
+    for sender, receiver in ((5, 4), (1, 20)):
+        moves = np.array([[h] * 3, [-h] * 3])
+        if sender == 5:
+            moves = np.array([[h, 0, h], [0, 0, 0], [0, 0, 0], [0, -h, 0]])
+        rows = np.tile(link, (len(moves), 1, 1, 1))
+        rows[:, :, receiver - 1, sender - 1] += moves
+        E = sf.predict(s, LinkRows(None, rows)).values("std:x")[:, -1]
+        # one-sided where it cannot be central, to first order in h
+        wanted = (E[0] - E[1]) / (2 * h) if sender == 1 else (E[0] - E[1]) / h + (E[2] - E[3]) / h
+        (place,) = [i for i, of in enumerate(found.links) if of == (sender, (receiver,))]
+        assert found.derivative[place] == pytest.approx(wanted, rel=1e-6 if sender == 1 else 1e-3)
+
+
+def test_a_link_that_is_not_heard_is_none():
+    s = thesis(agents=3, steps=2, link=0.5, hears=[[2], [1, 3], [2]])
+    assert {(i, j) for i, (j,) in sensitivity(s).links} == {(2, 1), (1, 2), (3, 2), (2, 3)}
+
+
+@pytest.mark.slow
+def test_the_steady_optimum_asked_backwards():
+    """Against what the contact chain gives after so many steps that the first no longer matter."""
+    found = least_link(thesis(steps=2), 30.0, steady=True, method="optimal")
+    late = sf.predict(thesis(steps=8), [found.link], "optimal").values()[0]
+    assert late[-1] == pytest.approx(30.0, rel=1e-4)
+    assert abs(late[-1] - 30.0) < abs(late[-3] - 30.0)
+    assert found.enclosure[1] - found.enclosure[0] < 1e-8
+    slope = sensitivity(thesis(), found.link, steady=True, method="optimal").derivative.sum()
+    assert slope == pytest.approx((found.above - found.below) / 2e-9, rel=1e-4)
+
+
 def test_where_several_are_the_worst_no_single_link_helps():
     found = sensitivity(thesis(), 0.5, agent="worst")
     assert found.first == ()
@@ -489,17 +547,19 @@ MATRIX = [[0, 0.5, 0.5], [0.5, 0, 0.5], [0.5, 0.5, 0]]
         (lambda: least_link(thesis(case=[{"name": "a", "link": 0.5}]), 20.0), "or none, got network.case"),
         (lambda: least_link(thesis(), 20.0, step=6), r"step: expected a number from 1 to 5 \(network.steps\), got 6"),
         (lambda: least_link(thesis(), 20.0, step=2, steady=True), "step: expected none with the steady state, got 2"),
-        (lambda: least_link(thesis(), 20.0, steady=True, method="general"), "steady: expected method simplified, got general"),
+        (lambda: least_link(thesis(), 20.0, steady=True, method="general"), "steady: expected method simplified or optimal, whose steady states are enclosed, got general"),
         (lambda: least_link(thesis(), 20.0, method="monte-carlo"), "got monte-carlo: its values are sampled"),
         (lambda: least_link(thesis(), 20.0, method="best"), "method: expected one of simplified, general.* got 'best'"),
         (lambda: least_link(thesis(), 20.0, of="area"), "metric: expected trace.* got 'area'"),
         (lambda: least_link(thesis(), 20.0, quantity="hoped"), "quantity: expected one of claimed.* got 'hoped'"),
         (lambda: sensitivity(thesis()), "sensitivity: expected links to start from, got none here nor in network.link"),
-        (lambda: sensitivity(thesis(agents=1), 0.5), "sensitivity: expected 2 to 12 agents, to list every link, got 1"),
-        (lambda: sensitivity(thesis(agents=13), 0.5), "sensitivity: expected 2 to 12 agents, to list every link, got 13"),
-        (lambda: sensitivity(thesis(link=[0.1, 0.2, 0.3, 0.4, 0.5])), "expected links that do not vary with the step"),
-        (lambda: sensitivity(thesis(), [[0, 1], [1, 0]]), r"link: expected a probability or a 3×3 matrix, got an array of shape \(2, 2\)"),
-        (lambda: sensitivity(thesis(), 1.5), "link: expected probabilities between 0 and 1, got 1.5 to 1.5"),
+        (lambda: sensitivity(thesis(agents=1), 0.5), "sensitivity: expected agents that hear one another, got no link"),
+        (
+            lambda: sensitivity(scenario(1.0, 1.0, 1.0, 1.0, 1.0, agents=60, sensors=[{"R": 1.0 + i % 5} for i in range(60)]), 0.5),
+            r"takes 5.\de\+10 updates, at most 2e\+08 are made: expected fewer steps or kinds of sensors, or links alike",
+        ),
+        (lambda: sensitivity(thesis(), [[0, 1], [1, 0]]), "a 3×3 matrix of them .*, or one of either for each of the 5 steps, got an array of 2×2"),
+        (lambda: sensitivity(thesis(), 1.5), "link: expected probabilities between 0 and 1, got 1.5"),
         (lambda: sensitivity(thesis(), case="a"), "case: expected none, as the scenario has no cases, got 'a'"),
         (lambda: sensitivity(thesis(), 0.5, case="a"), "case: expected none beside link probabilities of one's own, got 'a'"),
         (lambda: sensitivity(thesis(case=[{"name": "b", "link": 0.5}]), case="a"), "case: expected one of 'b', got 'a'"),

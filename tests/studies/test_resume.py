@@ -49,6 +49,7 @@ SAMPLED = f"""{SCENARIO}
 method = "monte-carlo"
 runs = 100
 """
+PRECISE = SAMPLED.replace("runs = 100", "precision = 0.05")
 # quick to work out, and long to write
 LARGE = f"""{SCENARIO}
 [vary]
@@ -471,16 +472,20 @@ def test_a_dask_cluster_of_two_workers_one_of_which_is_killed(cluster, tmp_path,
 
 @pytest.mark.slow
 def test_a_dask_cluster_of_four_workers_one_of_which_is_killed(tmp_path, quiet, collected):
+    """Points that draw until a precision is reached, each as many runs as alone."""
+    alone = tmp_path / "alone.csv"
+    (tmp_path / "alone.toml").write_text(PRECISE)
+    sf.study(tmp_path / "alone.toml", alone)
     with local_cluster(4) as four:
-        assert with_one_killed(four, 4, tmp_path) == quiet["sampled", ".csv"][0]
+        assert with_one_killed(four, 4, tmp_path, PRECISE) == content(alone)
 
 
-def with_one_killed(cluster, workers, tmp_path):
+def with_one_killed(cluster, workers, tmp_path, text=SAMPLED):
     """What a study of sampled points writes on a cluster of which a worker is killed after the first chunk."""
     from distributed import Client
 
     study, output = tmp_path / "mine.toml", tmp_path / "mine.csv"
-    study.write_text(SAMPLED)
+    study.write_text(text)
     client: Any = Client(cluster)
     with client:
         client.wait_for_workers(workers, timeout=20)

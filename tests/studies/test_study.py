@@ -30,6 +30,16 @@ def run(tmp_path, mapping, name="result.csv", **settings):
         return results, list(csv.DictReader(file))
 
 
+def test_values_are_written_as_on_the_command_line(tmp_path):
+    """`0:1:0.5`, both ends included, is the list of these numbers."""
+    written, listed = (
+        run(tmp_path, asked({"network.link": v, "model.R": [50, 100]}), f"{i}.csv")[1]
+        for i, v in enumerate(("0:1:0.5", [0, 0.5, 1]))
+    )
+    assert written == listed
+    assert len({row["point"] for row in written}) == 6
+
+
 def expected(row, scenario="thesis-transient", quantity="claimed", metric="trace", **settings):
     """What `predict` says of a row of a result, made from the file's own columns."""
     keys = {"network.agents": "agents", "network.architecture": "architecture", "network.steps": "steps"}
@@ -142,7 +152,11 @@ def test_a_scenario_file_is_looked_for_beside_the_study(tmp_path):
         ({}, r"vary: expected a table of keys with their values, got nothing"),
         (asked({}), r"vary: expected at least one key with its values, got nothing"),
         (asked({"model.R": []}), r"vary\.model\.R: expected at least one value, got an empty list"),
-        (asked({"model.R": 3}), r"vary\.model\.R: expected a list of values, or {from, to, number}, got 3"),
+        (asked({"model.R": 3}), r"vary\.model\.R: expected a list of values, '0:1:0.25', or .*, got 3"),
+        (
+            asked({"model.R": "1:0:0.1"}),
+            r"vary\.model\.R: expected first:last:step with first ≤ last and step > 0, got",
+        ),
         (asked({"model.S": [1]}), r"vary\.model\.S: expected a known key, got an unknown one, 'S'"),
         (asked({"modle.R": [1]}), r"vary\.modle\.R: expected a known key, got an unknown one"),
         (
