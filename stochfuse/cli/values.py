@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from stochfuse.scenario.scenario import Scenario
 
 
-
 def named(text: str) -> tuple[str, ...]:
     """Return the estimators of `naive` or `naive,my_rules:Mine`; modules are looked for in the working folder too.
 
