@@ -1,8 +1,9 @@
 """The command line.  It only wires; what is heavy is imported inside the commands that need it.
 
 `app` has the commands' names and what becomes of errors, `options` what several commands take, `values` how its texts
-become values, `help` how it is shown, `progress` what is said while they work.  A new command is one file with a function
-of its name and its EXAMPLES, and its name in `app.COMMANDS`; what it takes as others do are groups of `options`.
+become values, `help` how it is shown, `progress` what is said while they work.  A new command is one file with a
+function of its name and its EXAMPLES, and its name in `app.COMMANDS`; what it takes as others do are groups of
+`options`.
 """
 
 from __future__ import annotations
