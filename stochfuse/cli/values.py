@@ -38,10 +38,10 @@ def options_for(*names: str) -> Iterator[None]:
     try:
         yield
     except UsageError as error:
-        name, colon, rest = str(error).partition(":")
-        if name.partition(" ")[0] not in names:
+        name = next((name for name in names if str(error).startswith((f"{name}:", f"{name} "))), None)
+        if name is None:
             raise
-        raise UsageError(f"--{name.replace('_', '-')}{colon}{rest}") from None
+        raise UsageError(f"--{name.replace('_', '-')}{str(error).removeprefix(name)}") from None
 
 
 def tell(lines: Iterable[str]) -> list[str]:

@@ -19,7 +19,7 @@ from stochfuse.prediction.compare import EstimatorComparison
 from stochfuse.questions.messages import RULES
 from stochfuse.report import document
 from stochfuse.report.comparisons import EstimatorView, estimator_table
-from stochfuse.report.plot import COLORS, below, figure_class, titled
+from stochfuse.report.plot import COLORS, band, below, canvas, labelled, titled
 from stochfuse.report.predictions import predict_csv, predict_table
 from stochfuse.report.table import Report, Table, number, to_csv
 from stochfuse.scenario.registry import ESTIMATORS, OPTIMAL, SIMPLIFIED
@@ -160,16 +160,15 @@ def figure_of(asked: PageInput, curves: Sequence[Curve]) -> str:
 
 
 def _figure(asked: PageInput, curves: Sequence[Curve]) -> Any:
-    figure = figure_class()(figsize=(10.0, 4.6), layout="constrained")
+    figure = canvas(10.0, 4.6)
     x, y = axes_of(asked, curves)
     for axes, along, label in zip(figure.subplots(1, 2), ("over", "steps"), (x, "step k"), strict=True):
         for name, color, dash, line in lines_of(curves, COLORS, along):
             style = "dashdot" if dash == "dotdash" else dash
             axes.plot(line.x, line.y, color=color, linestyle=style, label=name if along == "over" else None)
             if line.low is not None and line.high is not None:
-                axes.fill_between(line.x, line.low, line.high, color=color, alpha=0.18, linewidth=0)
-        axes.set(xlabel=label, ylabel=y)
-        axes.grid(color="0.85")
+                band(axes, line.x, line.low, line.high, color)
+        labelled(axes, label, y)
     titled(figure, numbers(asked, curves).title[0])
     below(figure)
     return figure

@@ -8,14 +8,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from textwrap import wrap
 from typing import Any
 
 import numpy as np
 
 from stochfuse.kalman.metrics import Metric
 from stochfuse.prediction.compare import Comparison, EstimatorComparison
-from stochfuse.report.plot import COLORS, MARKERS, MOST_MARKED, below, canvas, entry, labelled, titled
+from stochfuse.report.plot import COLORS, MARKERS, MOST_MARKED, below, canvas, entry, labelled, titled, wrapped
 from stochfuse.report.predictions import NOTHING, RATIO, WIDTH_95, PredictionView, plus_minus, predict_csv
 from stochfuse.report.rows import Curves
 from stochfuse.report.table import Report, Table, listed, number, stamped, to_csv
@@ -357,7 +356,7 @@ def _finish(axes: Any, label: str, curves: Curves, cases: Sequence[str]) -> None
     elif axes.get_ylim()[0] > 0:
         axes.set_ylim(bottom=0)
     if cases:
-        axes.set_xticks(range(len(cases)), ["\n".join(wrap(case, 16)) for case in cases], fontsize="small")
+        axes.set_xticks(range(len(cases)), [wrapped(case, 16) for case in cases], fontsize="small")
 
 
 def _marker(number: int) -> str:

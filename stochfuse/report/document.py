@@ -26,18 +26,8 @@ from stochfuse.scenario.as_toml import to_toml
 MOST_VECTORS, MOST_SCENARIO = 1_000_000, 200_000
 """Letters up to which a figure is drawn as vectors, and a scenario is shown."""
 PLAIN_WORDS = {
-    "stand-alone",
-    "cyclic",
-    "broadcast",
-    "state",
-    "mean",
-    "variance",
-    "std",
-    "trace",
-    "det",
-    "burst",
-    "delay",
-}
+    "stand-alone", "cyclic", "broadcast", "state", "mean", "variance", "std", "trace", "det", "burst", "delay",
+}  # fmt: skip
 """Words that mean themselves in a heading."""
 STYLE = """
 :root { color-scheme: light; }

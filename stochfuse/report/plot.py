@@ -104,13 +104,15 @@ def shades(n: int) -> Any:
     return colormaps["viridis"](np.linspace(0, 0.85, n))
 
 
+def wrapped(text: str, width: int) -> str:
+    """Return text in lines of a width."""
+    return "\n".join(wrap(text, width, break_on_hyphens=False))
+
+
 def titled(figure: Any, title: str, *lines: str) -> None:
     """Write title and explanation above everything, wrapped to the figure's width."""
-    room = figure.get_figwidth() - 0.4
-    words = wrap(title, int(room * PER_INCH["medium"]), break_on_hyphens=False)
-    for line in lines:
-        words += wrap(line, int(room * PER_INCH["medium"]), break_on_hyphens=False)
-    figure.suptitle("\n".join(words), fontsize="medium")
+    room = int((figure.get_figwidth() - 0.4) * PER_INCH["medium"])
+    figure.suptitle("\n".join(wrapped(line, room) for line in (title, *lines) if line), fontsize="medium")
 
 
 def below(figure: Any, handles: Sequence[Any] | None = None, title: str | None = None) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,19 @@ from stochfuse.prediction.quantities import OVERCONFIDENT, expectation, noun, ti
 from stochfuse.prediction.quantities import unit as unit_of
 from stochfuse.prediction.result import Limit, Prediction
 from stochfuse.prediction.swept import Swept
-from stochfuse.report.plot import DASHES, MARKERS, MOST_MARKED, band, below, canvas, direct, entry, labelled, titled
+from stochfuse.report.plot import (
+    DASHES,
+    MARKERS,
+    MOST_MARKED,
+    band,
+    below,
+    canvas,
+    direct,
+    entry,
+    labelled,
+    titled,
+    wrapped,
+)
 from stochfuse.report.rows import ResultRows, ShownCurve, whose
 from stochfuse.report.table import Report, Table, counted, listed, number, stamped, to_csv
 from stochfuse.scenario.registry import OPTIMAL, SIMPLIFIED
@@ -493,7 +504,7 @@ def draw_on(axes: Any, view: PredictionView) -> str:
     ]
     label = view.axis
     if view.statistic != "mean":
-        label = "\n".join(wrap(view.what.partition(": ")[2].partition(" [no unit")[0], 45))
+        label = wrapped(view.what.partition(": ")[2].partition(" [no unit")[0], 45)
     labelled(axes, curves.label, label, whole=curves.whole, zero=np.nanmin(view.values()) >= 0)
     left_out = f"{len(shown)} of {whole} {curves.what}" if len(shown) < whole else None
     direct(axes, lines, [curve.name for curve in shown], left_out)

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from textwrap import wrap
 from typing import Any
 
 import numpy as np
 
-from stochfuse.report.plot import DASHES, MARKERS, band, canvas, labelled, shades, titled
+from stochfuse.report.plot import DASHES, MARKERS, band, canvas, labelled, shades, titled, wrapped
 from stochfuse.report.table import Report, Table, number, stamped, to_csv
 
 SCHEMA = "stochfuse.reproduction/1"
@@ -260,9 +259,9 @@ def _draw_panel(axes, panel: Panel) -> None:
             band(axes, x, curve.low, curve.high, color)
     if all(curve.at is None for curve in panel.curves):
         axes.set_xticks(panel.x, panel.points)
-    labelled(axes, panel.x_label, "\n".join(wrap(panel.y_label, 45)))
+    labelled(axes, panel.x_label, wrapped(panel.y_label, 45))
     if panel.y_range is not None:
         axes.set_ylim(*panel.y_range)
-    axes.set_title("\n".join(wrap(panel.title, 60)), fontsize="small")
+    axes.set_title(wrapped(panel.title, 60), fontsize="small")
     few = len(panel.curves) <= 4 or len(panel.points) > 6
     axes.legend(fontsize="x-small", loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2 if few else 3)

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from stochfuse.errors import UsageError
 from stochfuse.report import studies
-from stochfuse.report.plot import COLORS, DASHES, MARKERS, canvas, labelled, spread
+from stochfuse.report.plot import COLORS, DASHES, MARKERS, canvas, labelled, spread, wrapped
 from stochfuse.report.rows import whose
 from stochfuse.report.studies import LONGEST, load_label, shortened, spoken, words_of
 from stochfuse.report.study_slices import (
@@ -227,11 +226,6 @@ def _entitle(axes: Any, title: str, plan: Plan, lines: Sequence[str]) -> None:
     axes.figure.suptitle(wrapped(title[0].upper() + title[1:], 80), fontsize="medium")
     whole = [f"Study {plan.name}, scenario {plan.scenario_name}; {whose(plan.agent)}", *filter(None, lines)]
     axes.set_title("\n".join(wrapped(line, 95) for line in whole), fontsize=SMALL)
-
-
-def wrapped(text: str, width: int) -> str:
-    """Return text in lines of a width."""
-    return "\n".join(wrap(text, width, break_on_hyphens=False))
 
 
 def wide(values: np.ndarray) -> bool:

@@ -17,6 +17,7 @@ from stochfuse.report.results import report_of
 from stochfuse.scenario.as_toml import to_toml
 from stochfuse.scenario.scenario import preset_names
 from tests.cli.command import run
+from tests.data.robot_records import write
 
 MEANS = "link,step,covariance,count\n0.5,1,58.2,1000\n0.5,2,32.9,1000\n"
 SCRIPT = "<script>alert(1)</script>"
@@ -120,16 +121,31 @@ def test_crosscheck_that_disagrees_writes_the_page_all_the_same(tmp_path):
 
 @pytest.mark.slow
 def test_run_and_study(tmp_path):
-    run("simulate", "--steps", "3", "--link", "0.5", "-o", tmp_path / "sim")
-    run("run", "--steps", "3", "--link", "0.5", "--measurements", tmp_path / "sim" / "measurements.csv",
-        "--report", tmp_path / "run.html")  # fmt: skip
-    text = page_of(tmp_path / "run.html").text
-    assert "Normalised estimation error squared" in text
-    assert "NEES" in text
+    drawn = ("--steps", "3", "--link", "0.5")
+    run("simulate", *drawn, "-o", tmp_path / "sim", "--report", tmp_path / "simulate.html")
+    measurements = tmp_path / "sim" / "measurements.csv"
+    run("run", *drawn, "--measurements", measurements, "--report", tmp_path / "run.html")
+    for name in ("simulate", "run"):
+        page = page_of(tmp_path / f"{name}.html")
+        assert "Normalised estimation error squared" in page.text
+        assert f"stochfuse {name} --steps 3" in page.text
+        assert "svg" in page.tags
     (tmp_path / "s.toml").write_text('scenario = "thesis-transient"\n[vary]\n"network.link" = [0.2, 0.8]\n')
     run("study", "s.toml", "-o", "s.csv", "--report", "s.html", cwd=tmp_path)
     page = page_of(tmp_path / "s.html")
     assert "network.link" in page.text
+    assert "svg" in page.tags
+
+
+@pytest.mark.slow
+def test_robots_have_a_page_without_a_scenario(tmp_path):
+    write(tmp_path, 1, landmarks=6, seconds=61.0, interval=0.5)
+    asked = ("--data", tmp_path, "--until", "30", "--link", "0,1", "--estimator", "stand-alone", "--runs", "1")
+    run("run", "utias", *asked, "--report", tmp_path / "r.html")
+    page = page_of(tmp_path / "r.html")
+    assert "Robots of" in page.text
+    assert "How to cite" in page.text
+    assert "Scenario" not in page.text
     assert "svg" in page.tags
 
 
