@@ -6,7 +6,9 @@ latest step of each agent, 0 for none; an intersection is the elementwise minimu
 With `shared`, one more column holds the common start.  Of many rows at once,
 
     max(D)     the latest node left in each row, until none is left that no pedigree of those before it covers
-    terms      fuse(D) = Σ c_X · fuse(X) brought forward:  c ← c + [top] − c ∩ top, a node at a time, for all rows
+    terms      fuse(D) = Σ c_X · fuse(X) brought forward, over a family A_1 … A_m of pedigrees, the largest first:
+               c(A_1 … A_m) = Σ_j [A_j] − c(the largest of A_1 ∩ A_j … A_{j−1} ∩ A_j), all sets and families at once;
+               what lies in another of a family changes no union, so that most of these are of one intersection
     equal rows are one: the coefficients of equal intersections of a set are added up, and 0 goes
     numbers    the intersections of D are all of earlier steps than D, so that one stack after the other is summed up
 
@@ -20,7 +22,7 @@ is put in; here sums that cancel meet in floating point, which costs a few digit
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import islice
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -31,16 +33,12 @@ from stochfuse.estimators.protocol import StepOutcomes
 from stochfuse.estimators.together import measured_too
 from stochfuse.kalman.kernel import Estimate
 
-LISTED = 4
-"""Maximal nodes of a set of which all intersections are listed before equal ones are put together."""
-AT_A_TIME, MOST_SETS = 1 << 16, 1 << 13
-"""Terms, about, and sets that are at hand at a time."""
+AT_A_TIME, MOST_SETS = 1 << 22, 1 << 12
+"""Bytes, about, of intersections, and sets, that are at hand at a time."""
 TOLD = np.uint64(51)
 """Bits that tell the intersections of one set apart; the others number the sets."""
 MOST_ROWS = 1 << 30
 """Bytes of intersections beyond which, gone through several times, a machine has too little memory."""
-NARROW = 8
-"""Words of a row up to which they are gone through one by one."""
 
 _RANDOM = np.random.default_rng(5).integers(1 << 64, size=(3, 1 << 13), dtype=np.uint64) | np.uint64(1)
 
@@ -50,19 +48,16 @@ class _Terms(NamedTuple):
 
     Parameters
     ----------
-    keys : number of the set, and from the bit `TOLD` down a hash of the intersection; sorted.
+    of : number of the set, in order.
     times : coefficient.
     rows : latest steps.
+    hashes : of the rows.
     """
 
-    keys: np.ndarray
+    of: np.ndarray
     times: np.ndarray
     rows: np.ndarray
-
-    @property
-    def of(self) -> np.ndarray:
-        """Number of the set."""
-        return (self.keys >> TOLD).astype(np.intp)
+    hashes: np.ndarray
 
 
 class _Sums(NamedTuple):
@@ -104,13 +99,13 @@ class GraphTogether:
         width = -(-(self.agents + shared) // size) * size
         items = runs * self.agents
         self._nodes = np.zeros((steps + 1, items, width), kind)
+        self._sizes = np.zeros((steps + 1) * items, dtype=np.intp)
         self._run = np.repeat(np.arange(runs), self.agents)
         self._known = np.zeros((items, width), kind)
         start = packed(sources.starts[0])
         self._room, self._number = np.zeros((2 * items, *start.shape)), 0
         self._steps = np.zeros(0, dtype=np.intp)
         self._found: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-        self._each: dict[int, float] = {}
         self._fused = np.zeros(items, dtype=np.intp)
         if shared:
             self._known[:, self.agents] = 1
@@ -147,6 +142,7 @@ class GraphTogether:
         rows = self._nodes[step]
         rows[:] = self._known
         rows[everyone, everyone % self.agents] = step
+        self._sizes[step * len(rows) : (step + 1) * len(rows)] = _sizes(rows)
         if step == 1:
             values = np.tile(np.stack([packed(self.sources.starts[of]) for of in self.of]), (self.runs, 1, 1))
         else:
@@ -189,56 +185,73 @@ class GraphTogether:
         first = first[self._places(np.full(len(first), level), keys[first]) < 0]
         rows, keys, run = rows[first], keys[first], run[first]
         places = self._add(level, keys, 0.0)
-        tops, number = self._maximal(rows, run * self.agents)
-        for heard in np.flatnonzero(np.bincount(number)).tolist():
-            members = np.flatnonzero(number == heard)
-            begin = 0
-            while begin < len(members):
-                # as many as are expected to make so many terms, judged by the last ones
-                each = self._each.get(heard) or max(2.0 ** min(heard, LISTED), 3.0 * self._each.get(heard - 1, 1.0))
-                some = members[begin : begin + min(MOST_SETS, int(AT_A_TIME / each) + 1)]
-                begin += len(some)
-                terms = self._terms(tops[:heard, some])
-                of = terms.of
-                self._each[heard] = max(len(of) / len(some), 2.0 ** min(heard, LISTED))
-                term_keys = self._keys(_hashes(_words(terms.rows)), run[some][of])
-                first, which = _different(term_keys)
-                different, levels = term_keys[first], terms.rows[first, : self.agents].max(axis=1).astype(np.intp)
-                unknown = self._places(levels, different) < 0
-                for below in np.flatnonzero(np.bincount(levels[unknown])).tolist():
-                    here = first[unknown & (levels == below)]
-                    wanted.setdefault(below, []).append((terms.rows[here], term_keys[here], run[some][of[here]]))
-                ends = np.searchsorted(of, np.arange(len(some) + 1))
-                yield _Sums(places[some], ends, terms.times, which, levels, different)
+        for first, tops, of in self._in_parts(*self._maximal(rows, run * self.agents)):
+            terms = self._terms(tops, of)
+            term_runs = run[first + terms.of]
+            term_keys = self._keys(terms.hashes, term_runs)
+            one, which = _different(term_keys)
+            different, levels = term_keys[one], terms.rows[one, : self.agents].max(axis=1).astype(np.intp)
+            unknown = self._places(levels, different) < 0
+            for below in np.flatnonzero(np.bincount(levels[unknown])).tolist():
+                here = one[unknown & (levels == below)]
+                wanted.setdefault(below, []).append((terms.rows[here], term_keys[here], term_runs[here]))
+            ends = np.searchsorted(terms.of, np.arange(of[-1] + 2))
+            yield _Sums(places[first : first + of[-1] + 1], ends, terms.times, which, levels, different)
 
-    def _terms(self, tops: np.ndarray) -> _Terms:
-        """Intersections of the pedigrees of sets' maximal nodes (number, sets), latest first, with coefficients."""
-        nodes = _words(self._nodes).reshape(-1, self._nodes.shape[-1] * self._nodes.itemsize // 8)
-        # the small pedigrees first: what they leave is soon alike
-        brought = (nodes.take(top, axis=0).view(self._nodes.dtype) for top in tops[::-1])
-        terms = _listed(list(islice(brought, LISTED)))
-        for each in brought:
-            terms = _joined(terms, each)
-            if terms.rows.nbytes > MOST_ROWS:
-                raise self._too_many(len(tops), len(terms.keys))
-        return terms
+    def _in_parts(self, tops: np.ndarray, of: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+        """Maximal nodes of as many sets as are at hand at a time: number of the first set, nodes, numbers from there."""
+        number = np.bincount(of)
+        size = number * (number - 1) // 2 * self._known.strides[0]
+        part = np.cumsum(np.maximum(size, AT_A_TIME // MOST_SETS)) // AT_A_TIME
+        starts = np.flatnonzero(np.diff(part, prepend=-1))
+        ends = np.cumsum(number)
+        for first, beyond in pairwise([*starts.tolist(), len(number)]):
+            some = slice(ends[first] - number[first], ends[beyond - 1])
+            yield first, tops[some], of[some] - first
+
+    def _terms(self, tops: np.ndarray, of: np.ndarray) -> _Terms:
+        """Intersections of the pedigrees of sets' maximal nodes, the largest first, with coefficients.
+
+        Parameters
+        ----------
+        tops : the nodes.
+        of : number of the set that each is of, in order.
+        """
+        rows, family, sign = self._nodes.reshape(-1, self._nodes.shape[-1]).take(tops, axis=0), of, 1
+        found = [(rows, of, np.ones(len(of), dtype=np.intp))]
+        while True:
+            sizes = np.bincount(family)
+            before = np.arange(len(family)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+            family = np.repeat(np.arange(len(rows)), before)
+            if not len(family):
+                break
+            if len(family) * rows.strides[0] > MOST_ROWS:
+                raise self._too_many(int(np.bincount(of).max()), len(family))
+            other = np.arange(len(family)) - np.repeat(np.cumsum(before) - before, before)
+            other += (np.arange(len(rows)) - before).take(family)
+            shared = np.minimum(rows.take(other, axis=0), rows.take(family, axis=0))
+            largest = _largest(shared, family)
+            rows, family = shared.take(largest, axis=0), family.take(largest)
+            of, sign = of.take(family), -sign
+            found.append((rows, of, np.full(len(of), sign)))
+        return _together(*(np.concatenate(part) for part in zip(*found, strict=True)))
 
     def _maximal(self, sets: np.ndarray, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes without a descendant in each set, latest first, (most, sets), −1 where there is none; and how many."""
+        """Nodes without a descendant in each set, the largest first, and the number of the set that each is of."""
         nodes = self._nodes.reshape(-1, sets.shape[1])
-        left, found = sets.copy(), []
-        everyone, active = np.arange(len(sets)), np.arange(len(sets))
-        number = np.zeros(len(sets), dtype=np.intp)
+        left, found, of = sets.copy(), [], []
+        active = np.arange(len(sets))
         while len(active):
             agent = left.argmax(axis=1)
-            top = left[everyone[: len(active)], agent].astype(np.intp) * len(self._known) + base[active] + agent
-            found.append(np.full(len(sets), -1))
-            found[-1][active] = top
-            number[active] += 1
+            top = left[np.arange(len(active)), agent].astype(np.intp) * len(self._known) + base[active] + agent
+            found.append(top)
+            of.append(active)
             left *= nodes.take(top, axis=0) < sets[active]
             more = left.any(axis=1)
             left, active = left[more], active[more]
-        return np.array(found), number
+        tops, number = np.concatenate(found), np.concatenate(of)
+        order = np.argsort((number << 32) - self._sizes.take(tops))
+        return tops[order], number[order]
 
     def _evaluate(self, sums: Sequence[_Sums]) -> None:
         """Sum up the values of the sets of one level."""
@@ -308,38 +321,38 @@ class GraphTogether:
         )
 
 
-def _listed(tops: Sequence[np.ndarray]) -> _Terms:
-    """Terms of sets with few maximal nodes: every intersection, then equal ones together."""
-    rows, times = tops[0][None], np.ones(1, dtype=np.intp)
-    for each in tops[1:]:
-        rows = np.concatenate([rows, np.minimum(rows, each), each[None]])
-        times = np.concatenate([times, -times, [1]])
-    sets = np.arange(len(tops[0]))
-    return _together(
-        _words(rows.reshape(-1, rows.shape[-1])), np.repeat(times, len(sets)), np.tile(sets, len(times)), rows.dtype
-    )
+def _largest(rows: np.ndarray, family: np.ndarray) -> np.ndarray:
+    """Rows that lie in no other of their family, one of equal ones and none that is empty: by family, largest first."""
+    sizes = _sizes(rows)
+    left, found = np.flatnonzero(sizes), [np.zeros(0, dtype=np.intp)]
+    while len(left):
+        starts = np.flatnonzero(np.diff(family.take(left), prepend=-1))
+        # a largest one lies in no other
+        found.append(np.maximum.reduceat(sizes.take(left) << 32 | left, starts) & (1 << 32) - 1)
+        largest = np.repeat(found[-1], np.diff(starts, append=len(left)))
+        some = rows.take(left, axis=0)
+        beyond = _words(np.minimum(rows.take(largest, axis=0), some)) != _words(some)
+        left = left[np.einsum("ij->i", beyond)]
+    largest = np.concatenate(found)
+    return largest[np.argsort(family[largest], kind="stable")]
 
 
-def _joined(terms: _Terms, tops: np.ndarray) -> _Terms:
-    """Terms of sets with one maximal node more each."""
-    of = terms.of
-    shared = _words(np.minimum(terms.rows, _words(tops).take(of, axis=0).view(tops.dtype)))
-    rows = np.concatenate([_words(terms.rows), shared, _words(tops)])
-    times = np.concatenate([terms.times, -terms.times, np.ones(len(tops), dtype=np.intp)])
-    return _together(rows, times, np.concatenate([of, of, np.arange(len(tops))]), tops.dtype)
+def _sizes(rows: np.ndarray) -> np.ndarray:
+    """Number of nodes in each set."""
+    return np.einsum("ij->i", rows, dtype=np.uint32, casting="unsafe").astype(np.intp)
 
 
-def _together(words: np.ndarray, times: np.ndarray, of: np.ndarray, kind: np.dtype) -> _Terms:
+def _together(rows: np.ndarray, of: np.ndarray, times: np.ndarray) -> _Terms:
     """Terms of sets, of each set equal ones added up."""
-    keys = of.astype(np.uint64) << TOLD | _hashes(words) >> np.uint64(64) - TOLD
+    hashes = _hashes(_words(rows))
+    keys = of.astype(np.uint64) << TOLD | hashes >> np.uint64(64) - TOLD
     order = np.argsort(keys)
     keys = keys.take(order)
     starts = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
-    total, keys = np.add.reduceat(times.take(order), starts), keys.take(starts)
-    # where nothing is shared the hash is 0
-    kept = np.flatnonzero((total != 0) & (keys << np.uint64(64) - TOLD != 0))
-    rows = words.take(order.take(starts.take(kept)), axis=0).view(kind)
-    return _Terms(keys.take(kept), total.take(kept), rows)
+    total = np.add.reduceat(times.take(order), starts)
+    kept = np.flatnonzero(total)
+    one = order.take(starts.take(kept))
+    return _Terms(of.take(one), total.take(kept), rows.take(one, axis=0), hashes.take(one))
 
 
 def _different(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -360,19 +373,9 @@ def _words(rows: np.ndarray) -> np.ndarray:
 def _hashes(words: np.ndarray) -> np.ndarray:
     """One number of 64 bits for every row of words, 0 for the empty one."""
     one, other = _RANDOM[:2, : words.shape[1]]
-    half = np.uint64(32)
-    if words.shape[1] > NARROW:
-        mixed = words * one
-        mixed ^= mixed >> half
-        mixed *= other
-        total = mixed.sum(axis=1)
-    else:
-        total = np.zeros(len(words), dtype=np.uint64)
-        for column, a, b in zip(words.T, one, other, strict=True):
-            mixed = column * a
-            mixed ^= mixed >> half
-            mixed *= b
-            total += mixed
-    total ^= total >> half
+    mixed = words * one
+    mixed ^= mixed >> np.uint64(32)
+    total = np.einsum("ij,j->i", mixed, other)
+    total ^= total >> np.uint64(32)
     total *= _RANDOM[2, 2]
     return total
