@@ -13,7 +13,7 @@ With `shared`, one more column holds the common start.  Of many rows at once,
     numbers    the intersections of D are all of earlier steps than D, so that one stack after the other is summed up
 
 Sets met before by the same run, whoever met them and when, are not gone through again.  A row is told by a hash of 64
-bits, so that two rows are confused once in 10^19 pairs; among the intersections of one set by 51 of these bits.
+bits, so that two rows are confused once in 10^19 pairs.
 
 The same numbers as those of `stochfuse.estimators.local_fusion_graph`, which writes down what it does before any number
 is put in; here sums that cancel meet in floating point, which costs a few digits of the sixteen.
@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,31 +33,12 @@ from stochfuse.estimators.protocol import StepOutcomes
 from stochfuse.estimators.together import measured_too
 from stochfuse.kalman.kernel import Estimate
 
-AT_A_TIME, MOST_SETS = 1 << 22, 1 << 12
-"""Bytes, about, of intersections, and sets, that are at hand at a time."""
-TOLD = np.uint64(51)
-"""Bits that tell the intersections of one set apart; the others number the sets."""
+AT_A_TIME = 1 << 22
+"""Bytes, about, of intersections that are at hand at a time."""
 MOST_ROWS = 1 << 30
 """Bytes of intersections beyond which, gone through several times, a machine has too little memory."""
 
 _RANDOM = np.random.default_rng(5).integers(1 << 64, size=(3, 1 << 13), dtype=np.uint64) | np.uint64(1)
-
-
-class _Terms(NamedTuple):
-    """Intersections in the sums of some sets.
-
-    Parameters
-    ----------
-    of : number of the set, in order.
-    times : coefficient.
-    rows : latest steps.
-    hashes : of the rows.
-    """
-
-    of: np.ndarray
-    times: np.ndarray
-    rows: np.ndarray
-    hashes: np.ndarray
 
 
 class _Sums(NamedTuple):
@@ -66,18 +47,13 @@ class _Sums(NamedTuple):
     Parameters
     ----------
     places : of the sets.
-    first : where the terms of each begin, and where all end.
-    times : coefficient of each term.
-    which : of each term, the number of its intersection among the different ones.
-    levels, keys : latest step and key of the different ones.
+    terms : places of the different intersections.
+    times : coefficients, a sparse matrix (sets, different intersections).
     """
 
     places: np.ndarray
-    first: np.ndarray
-    times: np.ndarray
-    which: np.ndarray
-    levels: np.ndarray
-    keys: np.ndarray
+    terms: np.ndarray
+    times: Any
 
 
 class GraphTogether:
@@ -104,14 +80,14 @@ class GraphTogether:
         self._known = np.zeros((items, width), kind)
         start = packed(sources.starts[0])
         self._room, self._number = np.zeros((2 * items, *start.shape)), 0
-        self._steps = np.zeros(0, dtype=np.intp)
+        self._steps = np.zeros(len(self._room), dtype=np.intp)
         self._found: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self._fused = np.zeros(items, dtype=np.intp)
         if shared:
             self._known[:, self.agents] = 1
-            first = self._known[:: self.agents]
-            common = packed(sources.starts[COMMON])
-            self._add(0, self._keys(_hashes(_words(first)), np.arange(runs)), np.repeat(common[None], runs, axis=0))
+            keys = self._keys(self._known[:: self.agents], np.arange(runs))
+            places, _ = self._placed(np.zeros(runs, dtype=np.intp), np.sort(keys))
+            self._values[places] = packed(sources.starts[COMMON])
         self._step, self._schedule = 0, []
 
     @property
@@ -129,9 +105,9 @@ class GraphTogether:
         self._locals(now.missed)
         self._schedule.append(now.arrived)
         self._hear()
-        keys = self._keys(_hashes(_words(self._known)), self._run)
+        keys = self._keys(self._known, self._run)
         first, which = _different(keys)
-        places = self._valued(self._known[first], keys[first], self._run[first])
+        places = self._valued(keys[first], self._known[first], self._run[first])
         self._fused = places[which]
         claimed = unpacked(self._values[places], self.sources)
         return estimated(claimed, self._step)[0], which.reshape(self.runs, self.agents)
@@ -149,7 +125,10 @@ class GraphTogether:
             different, which = np.unique(self._fused, return_inverse=True)
             values = self._brought(different, step)[which]
             measured_too(values, self.sources, self.of, step, missed)
-        self._add(step, self._keys(_hashes(_words(rows)), self._run), values)
+        keys = self._keys(rows, self._run)
+        order = np.argsort(keys)
+        places, _ = self._placed(np.full(len(keys), step), keys[order])
+        self._values[places] = values[order]
 
     def _hear(self) -> None:
         """Let everyone know what the nodes that arrive rest on."""
@@ -163,78 +142,75 @@ class GraphTogether:
                 known[receiver[starts]] = np.maximum(known[receiver[starts]], brought)
         self._known = known
 
-    def _valued(self, rows: np.ndarray, keys: np.ndarray, run: np.ndarray) -> np.ndarray:
-        """Places of the values of some different sets of the step now."""
-        wanted = {self._step: [(rows, keys, run)]}
-        sums: list[list[_Sums]] = []
-        for level in range(self._step, 0, -1):
-            some = wanted.pop(level, [])
+    def _valued(self, keys: np.ndarray, rows: np.ndarray, run: np.ndarray) -> np.ndarray:
+        """Places of the values of some different sets of the step now, by their keys."""
+        places, new = self._placed(np.full(len(keys), self._step), keys)
+        wanted = {self._step: [(places[new], rows[new], run[new])]}
+        sums = [list(self._summed(wanted.pop(level), wanted)) for level in range(self._step, 0, -1) if level in wanted]
+        for some in reversed(sums):
             if some:
-                rows_now, keys_now, run_now = (np.concatenate(column) for column in zip(*some, strict=True))
-                sums.append(list(self._summed(level, rows_now, keys_now, run_now, wanted)))
-        for level_sums in reversed(sums):
-            if level_sums:
-                self._evaluate(level_sums)
-        return self._places(np.full(len(keys), self._step), keys)
+                self._evaluate(some)
+        return places
 
-    def _summed(
-        self, level: int, rows: np.ndarray, keys: np.ndarray, run: np.ndarray, wanted: dict[int, list]
-    ) -> Iterator[_Sums]:
-        """Sums of the sets of a level that are new; asks for the new sets that these rest on."""
-        first, _ = _different(keys)
-        first = first[self._places(np.full(len(first), level), keys[first]) < 0]
-        rows, keys, run = rows[first], keys[first], run[first]
-        places = self._add(level, keys, 0.0)
+    def _summed(self, some: list[tuple[np.ndarray, ...]], wanted: dict[int, list]) -> Iterator[_Sums]:
+        """Sums of new sets of a level, given by place, row and run; asks for the new sets that these rest on."""
+        from scipy.sparse import coo_array
+
+        places, rows, run = (np.concatenate(column) for column in zip(*some, strict=True))
+        if not len(places):
+            return
         for first, tops, of in self._in_parts(*self._maximal(rows, run * self.agents)):
-            terms = self._terms(tops, of)
-            term_runs = run[first + terms.of]
-            term_keys = self._keys(terms.hashes, term_runs)
-            one, which = _different(term_keys)
-            different, levels = term_keys[one], terms.rows[one, : self.agents].max(axis=1).astype(np.intp)
-            unknown = self._places(levels, different) < 0
-            for below in np.flatnonzero(np.bincount(levels[unknown])).tolist():
-                here = one[unknown & (levels == below)]
-                wanted.setdefault(below, []).append((terms.rows[here], term_keys[here], term_runs[here]))
-            ends = np.searchsorted(terms.of, np.arange(of[-1] + 2))
-            yield _Sums(places[first : first + of[-1] + 1], ends, terms.times, which, levels, different)
+            sets, shared, times = self._terms(tops, of)
+            run_of = run.take(first + sets)
+            keys = self._keys(shared, run_of)
+            one, which = _different(keys)
+            matrix = coo_array((times, (sets, which)), shape=(of[-1] + 1, len(one))).tocsr()
+            matrix.eliminate_zeros()
+            used = np.bincount(matrix.indices, minlength=len(one)) > 0
+            matrix.indices = (np.cumsum(used) - 1)[matrix.indices]
+            one = one[used]
+            levels = shared[one, : self.agents].max(axis=1).astype(np.intp)
+            terms, new = self._placed(levels, keys[one])
+            for level in np.flatnonzero(np.bincount(levels[new])).tolist():
+                here = new[levels[new] == level]
+                wanted.setdefault(level, []).append((terms[here], shared[one[here]], run_of[one[here]]))
+            yield _Sums(places[first : first + of[-1] + 1], terms, matrix)
 
     def _in_parts(self, tops: np.ndarray, of: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         """Maximal nodes of as many sets as are at hand at a time: number of the first set, nodes, numbers from there."""
         number = np.bincount(of)
-        size = number * (number - 1) // 2 * self._known.strides[0]
-        part = np.cumsum(np.maximum(size, AT_A_TIME // MOST_SETS)) // AT_A_TIME
+        part = np.cumsum(number * number // 2 * self._known.strides[0]) // AT_A_TIME
         starts = np.flatnonzero(np.diff(part, prepend=-1))
         ends = np.cumsum(number)
         for first, beyond in pairwise([*starts.tolist(), len(number)]):
             some = slice(ends[first] - number[first], ends[beyond - 1])
             yield first, tops[some], of[some] - first
 
-    def _terms(self, tops: np.ndarray, of: np.ndarray) -> _Terms:
-        """Intersections of the pedigrees of sets' maximal nodes, the largest first, with coefficients.
+    def _terms(self, tops: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Intersections of the pedigrees of sets' maximal nodes: number of the set, row, and coefficient.
 
         Parameters
         ----------
-        tops : the nodes.
+        tops : the nodes, the largest first.
         of : number of the set that each is of, in order.
         """
         rows, family, sign = self._nodes.reshape(-1, self._nodes.shape[-1]).take(tops, axis=0), of, 1
-        found = [(rows, of, np.ones(len(of), dtype=np.intp))]
+        found = [(of, rows, np.ones(len(of)))]
         while True:
             sizes = np.bincount(family)
             before = np.arange(len(family)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
             family = np.repeat(np.arange(len(rows)), before)
             if not len(family):
-                break
+                return tuple(np.concatenate(part) for part in zip(*found, strict=True))
             if len(family) * rows.strides[0] > MOST_ROWS:
-                raise self._too_many(int(np.bincount(of).max()), len(family))
+                raise self._too_many(int(np.bincount(found[0][0]).max()), len(family))
             other = np.arange(len(family)) - np.repeat(np.cumsum(before) - before, before)
             other += (np.arange(len(rows)) - before).take(family)
             shared = np.minimum(rows.take(other, axis=0), rows.take(family, axis=0))
             largest = _largest(shared, family)
             rows, family = shared.take(largest, axis=0), family.take(largest)
             of, sign = of.take(family), -sign
-            found.append((rows, of, np.full(len(of), sign)))
-        return _together(*(np.concatenate(part) for part in zip(*found, strict=True)))
+            found.append((of, rows, np.full(len(of), float(sign))))
 
     def _maximal(self, sets: np.ndarray, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nodes without a descendant in each set, the largest first, and the number of the set that each is of."""
@@ -247,7 +223,7 @@ class GraphTogether:
             found.append(top)
             of.append(active)
             left *= nodes.take(top, axis=0) < sets[active]
-            more = left.any(axis=1)
+            more = np.einsum("ij->i", _words(left) != 0)
             left, active = left[more], active[more]
         tops, number = np.concatenate(found), np.concatenate(of)
         order = np.argsort((number << 32) - self._sizes.take(tops))
@@ -257,16 +233,14 @@ class GraphTogether:
         """Sum up the values of the sets of one level."""
         from scipy.sparse import csr_array
 
-        places = [self._places(each.levels, each.keys) for each in sums]
-        different, which = np.unique(np.concatenate(places), return_inverse=True)
-        step = int(self._steps[sums[0].places[0]])
-        values = self._brought(different, step).reshape(len(different), -1)
+        different, which = np.unique(np.concatenate([each.terms for each in sums]), return_inverse=True)
+        values = self._brought(different, int(self._steps[sums[0].places[0]])).reshape(len(different), -1)
         begin = 0
-        for each, some in zip(sums, places, strict=True):
-            here = which[begin : begin + len(some)][each.which]
-            begin += len(some)
-            matrix = csr_array((each.times.astype(float), here, each.first), shape=(len(each.places), len(different)))
-            self._values[each.places] = (matrix @ values).reshape(-1, *self._values.shape[1:])
+        for places, terms, times in sums:
+            columns = which[begin : begin + len(terms)][times.indices]
+            begin += len(terms)
+            matrix = csr_array((times.data, columns, times.indptr), shape=(len(places), len(different)))
+            self._values[places] = (matrix @ values).reshape(-1, *self._values.shape[1:])
 
     def _brought(self, places: np.ndarray, step: int) -> np.ndarray:
         """Values brought forward to a step, in the order of their places."""
@@ -277,40 +251,39 @@ class GraphTogether:
             out[some] = brought_forward(out[some], self.sources, now + 1)
         return out
 
-    def _keys(self, hashes: np.ndarray, run: np.ndarray) -> np.ndarray:
-        """Tell rows of different runs apart."""
-        return (hashes ^ (run.astype(np.uint64) * _RANDOM[2, 0])) * _RANDOM[2, 1]
+    def _keys(self, rows: np.ndarray, run: np.ndarray) -> np.ndarray:
+        """Tell rows apart, and those of different runs."""
+        return (_hashes(rows) ^ (run.astype(np.uint64) * _RANDOM[2, 0])) * _RANDOM[2, 1]
 
-    def _places(self, levels: np.ndarray, keys: np.ndarray) -> np.ndarray:
-        """Where the values of sets stand, −1 where a set is new."""
-        out = np.full(len(keys), -1, dtype=np.intp)
+    def _placed(self, levels: np.ndarray, keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Places of the values of different sets, by level and key in order; and which of them are new."""
+        out, new = np.empty(len(keys), dtype=np.intp), []
         for level in np.flatnonzero(np.bincount(levels)).tolist():
-            if level in self._found:
-                known, places = self._found[level]
-                here = np.flatnonzero(levels == level)
-                at = np.searchsorted(known, keys[here])
-                at[at == len(known)] = 0
-                out[here] = np.where(known[at] == keys[here], places[at], -1)
-        return out
+            here = np.flatnonzero(levels == level)
+            if level not in self._found:
+                self._found[level] = np.zeros(0, dtype=np.uint64), np.zeros(0, dtype=np.intp)
+            (known, places), keys_now = self._found[level], keys[here]
+            at = np.searchsorted(known, keys_now)
+            within = np.minimum(at, len(known) - 1)
+            unknown = np.flatnonzero(known[within] != keys_now) if len(known) else np.arange(len(here))
+            fresh = np.arange(self._number, self._number + len(unknown))
+            if len(known):
+                out[here] = places[within]
+            out[here[unknown]] = fresh
+            at = at[unknown]
+            self._found[level] = np.insert(known, at, keys_now[unknown]), np.insert(places, at, fresh)
+            self._open(len(fresh), max(level, 1))
+            new.append(here[unknown])
+        return out, np.concatenate([np.zeros(0, dtype=np.intp), *new])
 
-    def _add(self, level: int, keys: np.ndarray, values: np.ndarray | float) -> np.ndarray:
-        """Places of new sets of a level, with their values."""
-        places = np.arange(self._number, self._number + len(keys))
-        self._number += len(keys)
+    def _open(self, number: int, step: int) -> None:
+        """Make room for some values more of a step."""
+        first, self._number = self._number, self._number + number
         if self._number > len(self._room):
-            room = np.empty((max(self._number, len(self._room) * 3 // 2), *self._room.shape[1:]))
-            room[: places[0]] = self._room[: places[0]]
-            self._room = room
-        self._room[places] = values
-        if level in self._found:
-            known, before = self._found[level]
-            keys_now, places_now = np.concatenate([known, keys]), np.concatenate([before, places])
-        else:
-            keys_now, places_now = keys, places
-        order = np.argsort(keys_now)
-        self._found[level] = keys_now[order], places_now[order]
-        self._steps = np.concatenate([self._steps, np.full(len(keys), max(level, 1))])
-        return places
+            more = max(self._number, len(self._room) * 3 // 2) - len(self._room)
+            self._room = np.concatenate([self._room, np.empty((more, *self._room.shape[1:]))])
+            self._steps = np.concatenate([self._steps, np.empty(more, dtype=np.intp)])
+        self._steps[first : self._number] = step
 
     def _too_many(self, heard: int, found: int) -> TooManyError:
         return TooManyError(
@@ -326,7 +299,8 @@ def _largest(rows: np.ndarray, family: np.ndarray) -> np.ndarray:
     sizes = _sizes(rows)
     left, found = np.flatnonzero(sizes), [np.zeros(0, dtype=np.intp)]
     while len(left):
-        starts = np.flatnonzero(np.diff(family.take(left), prepend=-1))
+        of = family.take(left)
+        starts = np.flatnonzero(np.concatenate([[True], of[1:] != of[:-1]]))
         # a largest one lies in no other
         found.append(np.maximum.reduceat(sizes.take(left) << 32 | left, starts) & (1 << 32) - 1)
         largest = np.repeat(found[-1], np.diff(starts, append=len(left)))
@@ -340,19 +314,6 @@ def _largest(rows: np.ndarray, family: np.ndarray) -> np.ndarray:
 def _sizes(rows: np.ndarray) -> np.ndarray:
     """Number of nodes in each set."""
     return np.einsum("ij->i", rows, dtype=np.uint32, casting="unsafe").astype(np.intp)
-
-
-def _together(rows: np.ndarray, of: np.ndarray, times: np.ndarray) -> _Terms:
-    """Terms of sets, of each set equal ones added up."""
-    hashes = _hashes(_words(rows))
-    keys = of.astype(np.uint64) << TOLD | hashes >> np.uint64(64) - TOLD
-    order = np.argsort(keys)
-    keys = keys.take(order)
-    starts = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
-    total = np.add.reduceat(times.take(order), starts)
-    kept = np.flatnonzero(total)
-    one = order.take(starts.take(kept))
-    return _Terms(of.take(one), total.take(kept), rows.take(one, axis=0), hashes.take(one))
 
 
 def _different(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -370,8 +331,9 @@ def _words(rows: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(rows).view(np.uint64)
 
 
-def _hashes(words: np.ndarray) -> np.ndarray:
-    """One number of 64 bits for every row of words, 0 for the empty one."""
+def _hashes(rows: np.ndarray) -> np.ndarray:
+    """One number of 64 bits for every row."""
+    words = _words(rows)
     one, other = _RANDOM[:2, : words.shape[1]]
     mixed = words * one
     mixed ^= mixed >> np.uint64(32)
