@@ -177,7 +177,7 @@ class GraphTogether:
             yield _Sums(places[first : first + of[-1] + 1], terms, matrix)
 
     def _in_parts(self, tops: np.ndarray, of: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-        """Maximal nodes of as many sets as are at hand at a time: number of the first set, nodes, numbers from there."""
+        """Maximal nodes of as many sets as are at hand at a time: the first set, nodes, numbers of their sets from there."""
         number = np.bincount(of)
         part = np.cumsum(number * number // 2 * self._known.strides[0]) // AT_A_TIME
         starts = np.flatnonzero(np.diff(part, prepend=-1))
@@ -201,7 +201,8 @@ class GraphTogether:
             before = np.arange(len(family)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
             family = np.repeat(np.arange(len(rows)), before)
             if not len(family):
-                return tuple(np.concatenate(part) for part in zip(*found, strict=True))
+                sets, intersections, times = zip(*found, strict=True)
+                return np.concatenate(sets), np.concatenate(intersections), np.concatenate(times)
             if len(family) * rows.strides[0] > MOST_ROWS:
                 raise self._too_many(int(np.bincount(found[0][0]).max()), len(family))
             other = np.arange(len(family)) - np.repeat(np.cumsum(before) - before, before)
