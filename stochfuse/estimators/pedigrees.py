@@ -177,7 +177,7 @@ class GraphTogether:
             yield _Sums(places[first : first + of[-1] + 1], terms, matrix)
 
     def _in_parts(self, tops: np.ndarray, of: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-        """Maximal nodes of as many sets as are at hand at a time: the first set, nodes, numbers of their sets from there."""
+        """Maximal nodes of as many sets as are at hand at a time: first set, nodes, numbers of sets from there."""
         number = np.bincount(of)
         part = np.cumsum(number * number // 2 * self._known.strides[0]) // AT_A_TIME
         starts = np.flatnonzero(np.diff(part, prepend=-1))
