@@ -522,10 +522,11 @@ class Claimed:
 
         Without the weight of any claim: for few numbers of many claims.
         """
-        found = np.zeros((self.width, values.shape[1]))
+        found, columns = np.zeros((self.width, values.shape[1])), np.ascontiguousarray(values.T)
+        of_factor = np.eye(len(self.view.factors))[self._factor_of]
         for some, pairs in self._pairs():
-            by_factor = np.add.reduceat(values[self.which[some]], self.view.starts, axis=1)
-            found += np.tensordot(pairs, by_factor, axes=((0, 1), (0, 1)))
+            by_factor = columns.take(self.which[some], axis=1) @ of_factor
+            found += np.tensordot(pairs, by_factor, axes=((0, 1), (1, 2)))
         return self.shared(found)
 
     def shared(self, found: np.ndarray) -> np.ndarray:
