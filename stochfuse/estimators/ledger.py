@@ -300,6 +300,14 @@ def different(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return order, np.flatnonzero(np.concatenate([[True], new]))
 
 
+def numbered(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Number of every key among the different ones, and where one of each of these is; see `different`."""
+    order, starts = different(keys)
+    which = np.empty(len(order), dtype=np.int64)
+    which[order] = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(order)))
+    return which, order[starts]
+
+
 class Sources:
     """What the atoms stand for: start and measurement information of every source, and how the state moves.
 
