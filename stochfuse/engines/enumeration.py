@@ -582,7 +582,7 @@ def _keys(view: FusedSet, states: slice, signatures: np.ndarray | None) -> np.nd
     if len(view.terms) == 1 or signatures is None:
         ((_, index),) = view.terms
         return ids[:, index].reshape(1, -1)
-    numbers = np.moveaxis(signatures[ids], -1, 0)
+    numbers = np.ascontiguousarray(signatures.T).take(ids, axis=1)
     keys = np.zeros((2, len(ids), len(view.terms[0][1])), dtype=np.uint64)
     for sign, index in view.terms:
         (np.add if sign > 0 else np.subtract)(keys, numbers.take(index, axis=2), out=keys)
