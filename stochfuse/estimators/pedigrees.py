@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.errors import TooManyError
-from stochfuse.estimators.ledger import COMMON, Sources, brought_forward, estimated, packed, unpacked
+from stochfuse.estimators.ledger import COMMON, Sources, brought_forward, estimated, numbered, packed, unpacked
 from stochfuse.estimators.protocol import StepOutcomes
 from stochfuse.estimators.together import measured_too
 from stochfuse.kalman.kernel import Estimate
@@ -106,7 +106,7 @@ class GraphTogether:
         self._schedule.append(now.arrived)
         self._hear()
         keys = self._keys(self._known, self._run)
-        first, which = _different(keys)
+        which, first = numbered(keys[None])
         places = self._valued(keys[first], self._known[first], self._run[first])
         self._fused = places[which]
         claimed = unpacked(self._values[places], self.sources)
@@ -163,7 +163,7 @@ class GraphTogether:
             sets, shared, times = self._terms(tops, of)
             run_of = run.take(first + sets)
             keys = self._keys(shared, run_of)
-            one, which = _different(keys)
+            which, one = numbered(keys[None])
             matrix = coo_array((times, (sets, which)), shape=(of[-1] + 1, len(one))).tocsr()
             matrix.eliminate_zeros()
             used = np.bincount(matrix.indices, minlength=len(one)) > 0
@@ -315,16 +315,6 @@ def _largest(rows: np.ndarray, family: np.ndarray) -> np.ndarray:
 def _sizes(rows: np.ndarray) -> np.ndarray:
     """Number of nodes in each set."""
     return np.einsum("ij->i", rows, dtype=np.uint32, casting="unsafe").astype(np.intp)
-
-
-def _different(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where one of each of the different keys is, in their order, and the number of every key among them."""
-    order = np.argsort(keys)
-    sorted_keys = keys[order]
-    new = np.concatenate([[True], sorted_keys[1:] != sorted_keys[:-1]])
-    which = np.empty(len(keys), dtype=np.intp)
-    which[order] = np.cumsum(new) - 1
-    return order[new], which
 
 
 def _words(rows: np.ndarray) -> np.ndarray:
