@@ -1,7 +1,7 @@
 """How far rounding can reach: the same computation again, every number moved by an ulp or some.
 
 Simplified formulation.  The square-root form subtracts nothing, so that what it loses is what its own numbers, rounded
-as they are, no longer tell: correlated noises whose difference a sensor resolves, say.  That is measured.  The form is run again with
+as they are, no longer tell: correlated noises whose difference a sensor resolves, say.  The form is run again with
 
 * every factor, after each prediction and before it, moved by a relative ε in each entry;
 * R moved by a relative ε in each entry, as its Cholesky factor is by rounding;
