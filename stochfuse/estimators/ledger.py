@@ -40,6 +40,8 @@ from stochfuse.scenario.model import Model, Sensor
 START, MEASURED, PRIOR, GIVEN = "start", "measured", "prior", "given"
 Atoms = tuple[tuple[int, int], ...]
 """Numbers of atoms and their coefficients, in order."""
+MANY = 1 << 14
+"""Terms from which on sums are added up by a sparse product, several times faster."""
 COMMON = -1
 """Source of an initial estimate that all agents share."""
 
@@ -372,6 +374,8 @@ def evaluate(ledger: Ledger, sources: Sources) -> Information:
 
     def total(values: np.ndarray, atoms: np.ndarray) -> np.ndarray:
         which, times, first = ledger.table(values)
+        if len(which) < MANY:  # in pairs, which loses a little less
+            return np.add.reduceat(times.reshape(-1, *(1,) * (atoms.ndim - 1)) * atoms[which], first, axis=0)
         return _summed([atoms], times, which, np.append(first, len(which)))[0]
 
     atoms, value_step = evaluate_atoms(ledger.atoms, sources, total), np.array(ledger.step)
