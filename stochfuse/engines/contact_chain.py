@@ -375,7 +375,7 @@ class LosslessFilter(NamedTuple):
     """What an agent that loses nothing would compute.
 
     One filter for all rows of link probabilities, or one for each: then noises have an axis of rows, see
-    `stochfuse.estimators.world.batched`, and so has what is carried, after that of the paths.
+    `stochfuse.scenario.system.Noises`, and so has what is carried, after that of the paths.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ import numpy as np
 from stochfuse.engines.events import ChanceEvent, Outcome, Rows, Weights, concerning, number_of_outcomes, outcomes
 from stochfuse.engines.progress import listener, uncollected
 from stochfuse.errors import TooManyError
-from stochfuse.estimators.ledger import different
+from stochfuse.estimators.ledger import different, numbered
 from stochfuse.estimators.protocol import AdditiveEstimator, Estimator
 from stochfuse.scenario.system import Detection
 
@@ -49,6 +49,8 @@ AT_A_TIME = 1 << 17
 """Outcomes of states, in every order of the agents, that are merged at a time."""
 LISTED = 1 << 21
 """Outcomes, or weights of some, that are gone through at a time while equal claims are found."""
+TRIED, WORTH = 1 << 16, 0.75
+"""Outcomes that are tried for equal claims, and the share of different ones up to which it is worth finding these."""
 MOST_ENDINGS = 1_000_000
 """Outcomes of the last exchange, over all states, up to which they are listed one by one."""
 WRITTEN_OUT = 10**30
@@ -522,10 +524,11 @@ class Claimed:
 
         Without the weight of any claim: for few numbers of many claims.
         """
-        found = np.zeros((self.width, values.shape[1]))
+        found, columns = np.zeros((self.width, values.shape[1])), np.ascontiguousarray(values.T)
+        of_factor = np.eye(len(self.view.factors))[self._factor_of]
         for some, pairs in self._pairs():
-            by_factor = np.add.reduceat(values[self.which[some]], self.view.starts, axis=1)
-            found += np.tensordot(pairs, by_factor, axes=((0, 1), (0, 1)))
+            by_factor = columns.take(self.which[some], axis=1) @ of_factor
+            found += np.tensordot(pairs, by_factor, axes=((0, 1), (1, 2)))
         return self.shared(found)
 
     def shared(self, found: np.ndarray) -> np.ndarray:
@@ -559,15 +562,18 @@ def claims_of(ending: Ending, signatures: np.ndarray | None, weights: Weights) -
     """
     for view in ending.views:
         cells = len(view.terms[0][1])
-        size = max(1, LISTED // cells)
+        size, tried = max(1, LISTED // cells), slice(0, max(1, TRIED // cells))
+        _, different_ones = different(_keys(view, tried, signatures))
+        alike = len(different_ones) < WORTH * cells * len(view.ids[tried])
         for first in range(0, len(view.ids), size):
             states = slice(first, first + size)
-            order, starts = different(_keys(view, states, signatures))
-            which = np.empty(len(order), dtype=np.int32)
-            which[order] = np.repeat(np.arange(len(starts)), np.diff([*starts, len(order)]))
-            row, cell = np.divmod(order[starts], cells)
-            terms = tuple((sign, view.ids[states][row, index[cell]]) for sign, index in view.terms)
-            yield Claimed(terms, which.reshape(-1, cells), view, ending.weights[states], ending.events, weights)
+            ids, order, which = view.ids[states], np.arange(len(view.ids[states]) * cells), None
+            if alike:
+                which, order = numbered(_keys(view, states, signatures))
+            row, cell = np.divmod(order, cells)
+            terms = tuple((sign, ids[row, index[cell]]) for sign, index in view.terms)
+            which = (order if which is None else which).astype(np.int32).reshape(-1, cells)
+            yield Claimed(terms, which, view, ending.weights[states], ending.events, weights)
 
 
 def _keys(view: FusedSet, states: slice, signatures: np.ndarray | None) -> np.ndarray:
@@ -576,7 +582,7 @@ def _keys(view: FusedSet, states: slice, signatures: np.ndarray | None) -> np.nd
     if len(view.terms) == 1 or signatures is None:
         ((_, index),) = view.terms
         return ids[:, index].reshape(1, -1)
-    numbers = np.moveaxis(signatures[ids], -1, 0)
+    numbers = np.ascontiguousarray(signatures.T).take(ids, axis=1)
     keys = np.zeros((2, len(ids), len(view.terms[0][1])), dtype=np.uint64)
     for sign, index in view.terms:
         (np.add if sign > 0 else np.subtract)(keys, numbers.take(index, axis=2), out=keys)

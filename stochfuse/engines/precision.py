@@ -1,7 +1,7 @@
-"""How far rounding can reach in the simplified formulation: the square-root form again, every number moved by an ulp.
+"""How far rounding can reach: the same computation again, every number moved by an ulp or some.
 
-The square-root form subtracts nothing, so that what it loses is what its own numbers, rounded as they are, no longer
-tell: correlated noises whose difference a sensor resolves, say.  That is measured.  The form is run again with
+Simplified formulation.  The square-root form subtracts nothing, so that what it loses is what its own numbers, rounded
+as they are, no longer tell: correlated noises whose difference a sensor resolves, say.  The form is run again with
 
 * every factor, after each prediction and before it, moved by a relative ε in each entry;
 * R moved by a relative ε in each entry, as its Cholesky factor is by rounding;
@@ -11,12 +11,9 @@ tell: correlated noises whose difference a sensor resolves, say.  That is measur
 with |ε| ≤ 2⁻⁵², and the largest change of the covariances is returned, in units of the states' standard deviations.
 The same ε serve all items, so that an item's answer does not depend on its company.
 
-How far rounding reaches in the exact methods: the same computation again, every number moved by an ulp.
-
-The general formulation works with sums of information, which lose what is weakly known beside what is known precisely;
-the optimum works in square-root form, which loses what the given numbers, rounded as they are, no longer tell.  Either
-is measured as `stochfuse.engines.precision` does it: run again with moved numbers, the largest change of the
-covariances counts, in units of the standard deviations.
+Exact methods.  The general formulation works with sums of information, which lose what is weakly known beside what is
+known precisely; the optimum works in square-root form.  Either is run again with moved numbers, and the largest change
+counts, in the same units.
 
 Four runs in the place of one are worth their time only where rounding may matter.  `suspects` tells by how much
 rounding may grow: first by a bound that costs next to nothing and clears most scenarios, then by the covariances of an
@@ -63,7 +60,7 @@ def within_an_ulp(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarra
 
 
 class Moving:
-    """What moves the numbers of a recursion in square-root form, see `stochfuse.engines.progress.numbers.Numbers`.
+    """What moves the numbers of a recursion in square-root form, see `stochfuse.kalman.kernel.SquareRootNumbers`.
 
     Parameters
     ----------
@@ -120,7 +117,8 @@ def rounding(case: Case, P: np.ndarray) -> np.ndarray:
 
     Parameters
     ----------
-    P : (steps, d, d, items) covariances as `run_like` gives them; NaN is returned where they are not finite.
+    P : (steps, d, d, items) covariances as `stochfuse.engines.mean_field.run_like` gives them; NaN is returned where
+        they are not finite.
     """
     reach = np.zeros(case.items)
     for first in range(0, case.items, BLOCK):

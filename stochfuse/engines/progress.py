@@ -14,12 +14,17 @@ from contextvars import ContextVar
 
 @contextmanager
 def uncollected() -> Iterator[None]:
-    """Keep the garbage collector from going through millions of small tuples, none in a cycle, again and again."""
+    """Keep the garbage collector from going through millions of small tuples, none in a cycle, again and again.
+
+    Those that stay are old ones afterwards: as new ones they would be gone through at once.
+    """
     enabled = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
+        gc.freeze()
+        gc.unfreeze()
         if enabled:
             gc.enable()
 

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stochfuse.estimators.ledger import Ledger, different
+from stochfuse.estimators.ledger import Ledger, numbered
 from stochfuse.estimators.protocol import FusionRule
 
 MOST_NODES, MOST_STATES = 48, 1 << 14
@@ -309,16 +309,8 @@ def _one_of_each(item: np.ndarray, rows: Sequence[np.ndarray]) -> tuple[np.ndarr
     keys = _hashes(rows)
     first = np.lexsort((keys[0], item))
     first = first[np.flatnonzero(np.diff(item[first], prepend=-1))]
-    which, one = _numbered(keys[:, first])
+    which, one = numbered(keys[:, first])
     return which, first[one]
-
-
-def _numbered(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Number of every key among the different ones, and where one of each of these is."""
-    order, starts = different(keys)
-    which = np.empty(len(order), dtype=np.int64)
-    which[order] = np.repeat(np.arange(len(starts)), np.diff([*starts, len(order)]))
-    return which, order[starts]
 
 
 def _states(rows: Sequence[np.ndarray]) -> list[GraphState]:
@@ -332,7 +324,7 @@ def _states(rows: Sequence[np.ndarray]) -> list[GraphState]:
 
 def _reachable(known: np.ndarray, below: np.ndarray) -> np.ndarray:
     """Nodes that a later search can meet, as masks; see `Pedigrees.reachable`."""
-    which, one = _numbered(_hashes([known, below]))
+    which, one = numbered(_hashes([known, below]))
     known, below = known[one], below[one]
     kept, done = np.zeros(len(known), dtype=np.int64), np.zeros(len(known), dtype=np.int64)
 

@@ -18,7 +18,7 @@ Values under numbers, when agents of one kind change places: what ledgers of sum
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from itertools import chain
+from itertools import chain, pairwise, repeat
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,10 @@ from stochfuse.kalman.kernel import (
 from stochfuse.scenario.model import Model, Sensor
 
 START, MEASURED, PRIOR, GIVEN = "start", "measured", "prior", "given"
+Atoms = tuple[tuple[int, int], ...]
+"""Numbers of atoms and their coefficients, in order."""
+MANY = 1 << 14
+"""Terms from which on sums are added up by a sparse product, several times faster."""
 COMMON = -1
 """Source of an initial estimate that all agents share."""
 
@@ -95,12 +99,13 @@ class Ledger(Renamed):
     def __init__(self, kinds: Sequence[int] | None = None) -> None:
         self.atoms: list[tuple[str, int, int]] = []
         self.step: list[int] = []
-        self.sums: list[tuple[tuple[int, int], ...]] = []
+        self.sums: list[Atoms] = []
         self._atom_of: dict[tuple[str, int, int], int] = {}
-        self._value_of: dict[tuple[int, tuple[tuple[int, int], ...]], int] = {}
+        self._value_of: dict[tuple[int, Atoms], int] = {}
         self._prior_of: dict[int, int] = {}
         self._local_of: dict[tuple[int, int | None], int] = {}
         self._random, self._steps = np.random.default_rng(0), np.zeros(0, dtype=np.int64)
+        self._pairs, self._ends = np.zeros((0, 2), dtype=np.int64), np.zeros(1, dtype=np.int64)
         self._of_atoms, self._signatures = np.zeros((0, 2), dtype=np.uint64), np.zeros((0, 2), dtype=np.uint64)
         super().__init__(kinds, None if kinds is None else Ledger())
 
@@ -161,16 +166,39 @@ class Ledger(Renamed):
         starts = np.searchsorted(of, np.arange(len(like)))
         signed = times.view(np.uint64)[:, None] * self.signatures()[brought]
         order, first = different(np.ascontiguousarray(np.add.reduceat(signed, starts, axis=0).T))
-        ends, terms = np.append(starts[1:], len(of)), np.stack([brought, times], axis=1)
-        new = [self.combine(int(step[one]), terms[starts[one] : ends[one]].tolist()) for one in order[first].tolist()]
+        number = np.full(len(like), -1)
+        number[order[first]] = np.arange(len(first))
+        one = np.flatnonzero(number[of] >= 0)
+        sums = self._added_up(number[of[one]], brought[one], times[one], len(first))
         out = np.empty(len(like), dtype=np.int64)
-        out[order] = np.repeat(new, np.diff([*first, len(order)]))
+        out[order] = np.repeat(self._values(step[order[first]].tolist(), sums), np.diff([*first, len(order)]))
         return out
+
+    def _added_up(self, of: np.ndarray, values: np.ndarray, times: np.ndarray, sums: int) -> list[Atoms]:
+        """Return so many sums, Σ times · value over the terms of each."""
+        atoms, each, first = self.table(values)
+        term = np.repeat(np.arange(len(values)), np.diff(first, append=len(atoms)))
+        # a set bit more than there are atoms: a number for each sum and atom
+        bits = len(self.atoms).bit_length()
+        keys, which = np.unique(of[term] << bits | atoms, return_inverse=True)
+        total = np.zeros(len(keys), dtype=np.int64)
+        np.add.at(total, which, each * times[term])
+        keys, total = keys[total != 0], total[total != 0]
+        pairs = list(zip((keys & (1 << bits) - 1).tolist(), total.tolist(), strict=True))
+        ends = np.searchsorted(keys >> bits, np.arange(sums + 1)).tolist()
+        return [tuple(pairs[begin:end]) for begin, end in pairwise(ends)]
 
     def locals(self, values: np.ndarray, source: int | None) -> np.ndarray:
         """Return many local estimates at a time, see `local`."""
         found, which = np.unique(values, return_inverse=True)
-        return np.array([self.local(value, source) for value in found.tolist()])[which].reshape(values.shape)
+        asked = [(value, source) for value in found.tolist()]
+        new = [value for value, _ in asked if (value, source) not in self._local_of]
+        if new:
+            step = self.step[new[0]] + 1
+            measured = () if source is None else ((self._atom(MEASURED, step, source), 1),)
+            sums = [tuple(sorted((*measured, (self._atom(PRIOR, step, value), 1)))) for value in new]
+            self._local_of.update(zip(zip(new, repeat(source)), self._values(repeat(step), sums), strict=False))
+        return np.array([self._local_of[pair] for pair in asked])[which].reshape(values.shape)
 
     def forwards(self, values: np.ndarray, step: int) -> np.ndarray:
         """Return many values brought forward, see `forward`; −1 stays."""
@@ -206,11 +234,17 @@ class Ledger(Renamed):
             self._signatures = np.concatenate([self._signatures[:known], found, np.zeros((1, 2), dtype=np.uint64)])
         return self._signatures
 
-    def table(self, values: Iterable[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def table(self, values: Sequence[int] | np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Sums of values: atoms and coefficients one after the other, and where each sum begins."""
-        sums = [self.sums[value] for value in values]
-        which, times = np.fromiter(chain.from_iterable(chain.from_iterable(sums)), dtype=np.int64).reshape(-1, 2).T
-        first = np.cumsum([0, *map(len, sums)])[:-1]
+        new = self.sums[len(self._ends) - 1 :]
+        if new:
+            pairs = np.fromiter(chain.from_iterable(chain.from_iterable(new)), dtype=np.int64).reshape(-1, 2)
+            self._pairs = np.concatenate([self._pairs, pairs])
+            self._ends = np.concatenate([self._ends, self._ends[-1] + np.cumsum(list(map(len, new)))])
+        some = np.asarray(values)
+        sizes = self._ends[some + 1] - self._ends[some]
+        first = np.cumsum(sizes) - sizes
+        which, times = self._pairs[np.arange(sizes.sum()) + np.repeat(self._ends[some] - first, sizes)].T
         return which, times, first
 
     def _renamed(self, value: int, into: Ledger, names: Sequence[int], known: dict[int, int]) -> int:
@@ -237,7 +271,16 @@ class Ledger(Renamed):
             self.atoms.append(key)
         return known
 
-    def _value(self, step: int, atoms: tuple[tuple[int, int], ...]) -> int:
+    def _values(self, steps: Iterable[int], sums: Sequence[Atoms]) -> list[int]:
+        """Return the numbers of different sums, of a step each."""
+        keys = list(zip(steps, sums, strict=False))
+        new = [key for key in keys if key not in self._value_of]
+        self._value_of.update(zip(new, range(len(self.sums), len(self.sums) + len(new)), strict=True))
+        self.step += [step for step, _ in new]
+        self.sums += [atoms for _, atoms in new]
+        return [self._value_of[key] for key in keys]
+
+    def _value(self, step: int, atoms: Atoms) -> int:
         key = (step, atoms)
         known = self._value_of.get(key)
         if known is None:
@@ -257,6 +300,14 @@ def different(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         order = np.lexsort(keys[::-1])
         new = (keys[:, order[1:]] != keys[:, order[:-1]]).any(axis=0)
     return order, np.flatnonzero(np.concatenate([[True], new]))
+
+
+def numbered(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Number of every key among the different ones, and where one of each of these is; see `different`."""
+    order, starts = different(keys)
+    which = np.empty(len(order), dtype=np.int64)
+    which[order] = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(order)))
+    return which, order[starts]
 
 
 class Sources:
@@ -323,7 +374,9 @@ def evaluate(ledger: Ledger, sources: Sources) -> Information:
 
     def total(values: np.ndarray, atoms: np.ndarray) -> np.ndarray:
         which, times, first = ledger.table(values)
-        return np.add.reduceat(times.reshape(-1, *(1,) * (atoms.ndim - 1)) * atoms[which], first, axis=0)
+        if len(which) < MANY:  # in pairs, which loses a little less
+            return np.add.reduceat(times.reshape(-1, *(1,) * (atoms.ndim - 1)) * atoms[which], first, axis=0)
+        return _summed([atoms], times, which, np.append(first, len(which)))[0]
 
     atoms, value_step = evaluate_atoms(ledger.atoms, sources, total), np.array(ledger.step)
     values = np.empty((len(ledger.sums), *atoms.shape[1:]))
@@ -407,22 +460,24 @@ class InformationClaims:
         NoAnswerError
             If some sum is no positive-definite information.
         """
-        y, Y = self.information
-        found = Information(None if y is None else _summed(y, terms), _summed(Y, terms))
-        estimate, magnified = estimated(found, step)
+        which = np.stack([values.ravel() for _, values in terms], axis=1)
+        signs = np.where(which < 0, 0.0, [sign for sign, _ in terms]).ravel()
+        ends = np.arange(0, which.size + 1, len(terms))
+        parts = [part for part in self.information if part is not None]
+        found = [
+            part.reshape(*terms[0][1].shape, *part.shape[1:])
+            for part in _summed(parts, signs, np.maximum(which, 0).ravel(), ends)
+        ]
+        estimate, magnified = estimated(Information(None if len(found) == 1 else found[0], found[-1]), step)
         return estimate, magnified.max(axis=(0, -1))
 
 
-def _summed(numbers: np.ndarray, terms: Sequence[tuple[int, np.ndarray]]) -> np.ndarray:
-    """Σ sign · numbers[values] over (sign, values of any one shape); the value −1 stands for nothing."""
+def _summed(parts: Sequence[np.ndarray], times: np.ndarray, which: np.ndarray, ends: np.ndarray) -> list[np.ndarray]:
+    """Σ times · part[which] from each of the ends to the next, of some arrays."""
     from scipy.sparse import csr_array
 
-    which = np.stack([values.ravel() for _, values in terms], axis=1)
-    signs = np.where(which < 0, 0.0, [sign for sign, _ in terms])
-    ends = np.arange(0, which.size + 1, len(terms))
-    places = (signs.ravel(), np.maximum(which, 0).ravel(), ends)
-    matrix = csr_array(places, shape=(len(which), len(numbers)))
-    return (matrix @ numbers.reshape(len(numbers), -1)).reshape(*terms[0][1].shape, *numbers.shape[1:])
+    matrix = csr_array((times.astype(float), which, ends), shape=(len(ends) - 1, len(parts[0])))
+    return [(matrix @ part.reshape(len(part), -1)).reshape(-1, *part.shape[1:]) for part in parts]
 
 
 def estimated(information: Information, step: int) -> tuple[Estimate, np.ndarray]:

@@ -17,9 +17,10 @@ equal intersections are counted together before anything is evaluated, which is 
 
 Which states behave alike.  A later search only meets nodes that are maximal in an intersection of two or more
 pedigrees: of agents, of messages under way, or of nodes met before.  (The maximal elements of a union of pedigrees are
-among the maximal elements of each, so that intersections of two suffice.)  `merge` drops all other nodes, forgets who
-made the rest (their value says all that is used), and takes like agents in one order.  The order is a relabelling
-of the true state whatever it is, so that states found equal are; the property tests compare with plain enumeration.
+among the maximal elements of each, so that intersections of two suffice.)  `GraphExchange.after` drops all other
+nodes, forgets who made the rest (their value says all that is used), and takes like agents in one order.  The order is
+a relabelling of the true state whatever it is, so that states found equal are; the property tests compare with plain
+enumeration.
 """
 
 from __future__ import annotations

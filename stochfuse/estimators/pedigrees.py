@@ -6,12 +6,14 @@ latest step of each agent, 0 for none; an intersection is the elementwise minimu
 With `shared`, one more column holds the common start.  Of many rows at once,
 
     max(D)     the latest node left in each row, until none is left that no pedigree of those before it covers
-    terms      fuse(D) = Σ c_X · fuse(X) brought forward:  c ← c + [top] − c ∩ top, a node at a time, for all rows
+    terms      fuse(D) = Σ c_X · fuse(X) brought forward, over a family A_1 … A_m of pedigrees, the largest first:
+               c(A_1 … A_m) = Σ_j [A_j] − c(the largest of A_1 ∩ A_j … A_{j−1} ∩ A_j), all sets and families at once;
+               what lies in another of a family changes no union, so that most of these are of one intersection
     equal rows are one: the coefficients of equal intersections of a set are added up, and 0 goes
     numbers    the intersections of D are all of earlier steps than D, so that one stack after the other is summed up
 
 Sets met before by the same run, whoever met them and when, are not gone through again.  A row is told by a hash of 64
-bits, so that two rows are confused once in 10^19 pairs; among the intersections of one set by 51 of these bits.
+bits, so that two rows are confused once in 10^19 pairs.
 
 The same numbers as those of `stochfuse.estimators.local_fusion_graph`, which writes down what it does before any number
 is put in; here sums that cancel meet in floating point, which costs a few digits of the sixteen.
@@ -20,49 +22,23 @@ is put in; here sums that cancel meet in floating point, which costs a few digit
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import islice
-from typing import NamedTuple
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from stochfuse.errors import TooManyError
-from stochfuse.estimators.ledger import COMMON, Sources, brought_forward, estimated, packed, unpacked
+from stochfuse.estimators.ledger import COMMON, Sources, brought_forward, estimated, numbered, packed, unpacked
 from stochfuse.estimators.protocol import StepOutcomes
 from stochfuse.estimators.together import measured_too
 from stochfuse.kalman.kernel import Estimate
 
-LISTED = 4
-"""Maximal nodes of a set of which all intersections are listed before equal ones are put together."""
-AT_A_TIME, MOST_SETS = 1 << 16, 1 << 13
-"""Terms, about, and sets that are at hand at a time."""
-TOLD = np.uint64(51)
-"""Bits that tell the intersections of one set apart; the others number the sets."""
+AT_A_TIME = 1 << 22
+"""Bytes, about, of intersections that are at hand at a time."""
 MOST_ROWS = 1 << 30
 """Bytes of intersections beyond which, gone through several times, a machine has too little memory."""
-NARROW = 8
-"""Words of a row up to which they are gone through one by one."""
 
 _RANDOM = np.random.default_rng(5).integers(1 << 64, size=(3, 1 << 13), dtype=np.uint64) | np.uint64(1)
-
-
-class _Terms(NamedTuple):
-    """Intersections in the sums of some sets.
-
-    Parameters
-    ----------
-    keys : number of the set, and from the bit `TOLD` down a hash of the intersection; sorted.
-    times : coefficient.
-    rows : latest steps.
-    """
-
-    keys: np.ndarray
-    times: np.ndarray
-    rows: np.ndarray
-
-    @property
-    def of(self) -> np.ndarray:
-        """Number of the set."""
-        return (self.keys >> TOLD).astype(np.intp)
 
 
 class _Sums(NamedTuple):
@@ -71,18 +47,13 @@ class _Sums(NamedTuple):
     Parameters
     ----------
     places : of the sets.
-    first : where the terms of each begin, and where all end.
-    times : coefficient of each term.
-    which : of each term, the number of its intersection among the different ones.
-    levels, keys : latest step and key of the different ones.
+    terms : places of the different intersections.
+    times : coefficients, a sparse matrix (sets, different intersections).
     """
 
     places: np.ndarray
-    first: np.ndarray
-    times: np.ndarray
-    which: np.ndarray
-    levels: np.ndarray
-    keys: np.ndarray
+    terms: np.ndarray
+    times: Any
 
 
 class GraphTogether:
@@ -104,19 +75,19 @@ class GraphTogether:
         width = -(-(self.agents + shared) // size) * size
         items = runs * self.agents
         self._nodes = np.zeros((steps + 1, items, width), kind)
+        self._sizes = np.zeros((steps + 1) * items, dtype=np.intp)
         self._run = np.repeat(np.arange(runs), self.agents)
         self._known = np.zeros((items, width), kind)
         start = packed(sources.starts[0])
         self._room, self._number = np.zeros((2 * items, *start.shape)), 0
-        self._steps = np.zeros(0, dtype=np.intp)
+        self._steps = np.zeros(len(self._room), dtype=np.intp)
         self._found: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-        self._each: dict[int, float] = {}
         self._fused = np.zeros(items, dtype=np.intp)
         if shared:
             self._known[:, self.agents] = 1
-            first = self._known[:: self.agents]
-            common = packed(sources.starts[COMMON])
-            self._add(0, self._keys(_hashes(_words(first)), np.arange(runs)), np.repeat(common[None], runs, axis=0))
+            keys = self._keys(self._known[:: self.agents], np.arange(runs))
+            places, _ = self._placed(np.zeros(runs, dtype=np.intp), np.sort(keys))
+            self._values[places] = packed(sources.starts[COMMON])
         self._step, self._schedule = 0, []
 
     @property
@@ -134,9 +105,9 @@ class GraphTogether:
         self._locals(now.missed)
         self._schedule.append(now.arrived)
         self._hear()
-        keys = self._keys(_hashes(_words(self._known)), self._run)
-        first, which = _different(keys)
-        places = self._valued(self._known[first], keys[first], self._run[first])
+        keys = self._keys(self._known, self._run)
+        which, first = numbered(keys[None])
+        places = self._valued(keys[first], self._known[first], self._run[first])
         self._fused = places[which]
         claimed = unpacked(self._values[places], self.sources)
         return estimated(claimed, self._step)[0], which.reshape(self.runs, self.agents)
@@ -147,13 +118,17 @@ class GraphTogether:
         rows = self._nodes[step]
         rows[:] = self._known
         rows[everyone, everyone % self.agents] = step
+        self._sizes[step * len(rows) : (step + 1) * len(rows)] = _sizes(rows)
         if step == 1:
             values = np.tile(np.stack([packed(self.sources.starts[of]) for of in self.of]), (self.runs, 1, 1))
         else:
             different, which = np.unique(self._fused, return_inverse=True)
             values = self._brought(different, step)[which]
             measured_too(values, self.sources, self.of, step, missed)
-        self._add(step, self._keys(_hashes(_words(rows)), self._run), values)
+        keys = self._keys(rows, self._run)
+        order = np.argsort(keys)
+        places, _ = self._placed(np.full(len(keys), step), keys[order])
+        self._values[places] = values[order]
 
     def _hear(self) -> None:
         """Let everyone know what the nodes that arrive rest on."""
@@ -167,93 +142,106 @@ class GraphTogether:
                 known[receiver[starts]] = np.maximum(known[receiver[starts]], brought)
         self._known = known
 
-    def _valued(self, rows: np.ndarray, keys: np.ndarray, run: np.ndarray) -> np.ndarray:
-        """Places of the values of some different sets of the step now."""
-        wanted = {self._step: [(rows, keys, run)]}
-        sums: list[list[_Sums]] = []
-        for level in range(self._step, 0, -1):
-            some = wanted.pop(level, [])
+    def _valued(self, keys: np.ndarray, rows: np.ndarray, run: np.ndarray) -> np.ndarray:
+        """Places of the values of some different sets of the step now, by their keys."""
+        places, new = self._placed(np.full(len(keys), self._step), keys)
+        wanted = {self._step: [(places[new], rows[new], run[new])]}
+        sums = [list(self._summed(wanted.pop(level), wanted)) for level in range(self._step, 0, -1) if level in wanted]
+        for some in reversed(sums):
             if some:
-                rows_now, keys_now, run_now = (np.concatenate(column) for column in zip(*some, strict=True))
-                sums.append(list(self._summed(level, rows_now, keys_now, run_now, wanted)))
-        for level_sums in reversed(sums):
-            if level_sums:
-                self._evaluate(level_sums)
-        return self._places(np.full(len(keys), self._step), keys)
+                self._evaluate(some)
+        return places
 
-    def _summed(
-        self, level: int, rows: np.ndarray, keys: np.ndarray, run: np.ndarray, wanted: dict[int, list]
-    ) -> Iterator[_Sums]:
-        """Sums of the sets of a level that are new; asks for the new sets that these rest on."""
-        first, _ = _different(keys)
-        first = first[self._places(np.full(len(first), level), keys[first]) < 0]
-        rows, keys, run = rows[first], keys[first], run[first]
-        places = self._add(level, keys, 0.0)
-        tops, number = self._maximal(rows, run * self.agents)
-        for heard in np.flatnonzero(np.bincount(number)).tolist():
-            members = np.flatnonzero(number == heard)
-            begin = 0
-            while begin < len(members):
-                # as many as are expected to make so many terms, judged by the last ones
-                each = self._each.get(heard) or max(2.0 ** min(heard, LISTED), 3.0 * self._each.get(heard - 1, 1.0))
-                some = members[begin : begin + min(MOST_SETS, int(AT_A_TIME / each) + 1)]
-                begin += len(some)
-                terms = self._terms(tops[:heard, some])
-                of = terms.of
-                self._each[heard] = max(len(of) / len(some), 2.0 ** min(heard, LISTED))
-                term_keys = self._keys(_hashes(_words(terms.rows)), run[some][of])
-                first, which = _different(term_keys)
-                different, levels = term_keys[first], terms.rows[first, : self.agents].max(axis=1).astype(np.intp)
-                unknown = self._places(levels, different) < 0
-                for below in np.flatnonzero(np.bincount(levels[unknown])).tolist():
-                    here = first[unknown & (levels == below)]
-                    wanted.setdefault(below, []).append((terms.rows[here], term_keys[here], run[some][of[here]]))
-                ends = np.searchsorted(of, np.arange(len(some) + 1))
-                yield _Sums(places[some], ends, terms.times, which, levels, different)
+    def _summed(self, some: list[tuple[np.ndarray, ...]], wanted: dict[int, list]) -> Iterator[_Sums]:
+        """Sums of new sets of a level, given by place, row and run; asks for the new sets that these rest on."""
+        from scipy.sparse import coo_array
 
-    def _terms(self, tops: np.ndarray) -> _Terms:
-        """Intersections of the pedigrees of sets' maximal nodes (number, sets), latest first, with coefficients."""
-        nodes = _words(self._nodes).reshape(-1, self._nodes.shape[-1] * self._nodes.itemsize // 8)
-        # the small pedigrees first: what they leave is soon alike
-        brought = (nodes.take(top, axis=0).view(self._nodes.dtype) for top in tops[::-1])
-        terms = _listed(list(islice(brought, LISTED)))
-        for each in brought:
-            terms = _joined(terms, each)
-            if terms.rows.nbytes > MOST_ROWS:
-                raise self._too_many(len(tops), len(terms.keys))
-        return terms
+        places, rows, run = (np.concatenate(column) for column in zip(*some, strict=True))
+        if not len(places):
+            return
+        for first, tops, of in self._in_parts(*self._maximal(rows, run * self.agents)):
+            sets, shared, times = self._terms(tops, of)
+            run_of = run.take(first + sets)
+            keys = self._keys(shared, run_of)
+            which, one = numbered(keys[None])
+            matrix = coo_array((times, (sets, which)), shape=(of[-1] + 1, len(one))).tocsr()
+            matrix.eliminate_zeros()
+            used = np.bincount(matrix.indices, minlength=len(one)) > 0
+            matrix.indices = (np.cumsum(used) - 1)[matrix.indices]
+            one = one[used]
+            levels = shared[one, : self.agents].max(axis=1).astype(np.intp)
+            terms, new = self._placed(levels, keys[one])
+            for level in np.flatnonzero(np.bincount(levels[new])).tolist():
+                here = new[levels[new] == level]
+                wanted.setdefault(level, []).append((terms[here], shared[one[here]], run_of[one[here]]))
+            yield _Sums(places[first : first + of[-1] + 1], terms, matrix)
+
+    def _in_parts(self, tops: np.ndarray, of: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+        """Maximal nodes of as many sets as are at hand at a time: first set, nodes, numbers of sets from there."""
+        number = np.bincount(of)
+        part = np.cumsum(number * number // 2 * self._known.strides[0]) // AT_A_TIME
+        starts = np.flatnonzero(np.diff(part, prepend=-1))
+        ends = np.cumsum(number)
+        for first, beyond in pairwise([*starts.tolist(), len(number)]):
+            some = slice(ends[first] - number[first], ends[beyond - 1])
+            yield first, tops[some], of[some] - first
+
+    def _terms(self, tops: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Intersections of the pedigrees of sets' maximal nodes: number of the set, row, and coefficient.
+
+        Parameters
+        ----------
+        tops : the nodes, the largest first.
+        of : number of the set that each is of, in order.
+        """
+        rows, family, sign = self._nodes.reshape(-1, self._nodes.shape[-1]).take(tops, axis=0), of, 1
+        found = [(of, rows, np.ones(len(of)))]
+        while True:
+            sizes = np.bincount(family)
+            before = np.arange(len(family)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+            family = np.repeat(np.arange(len(rows)), before)
+            if not len(family):
+                sets, intersections, times = zip(*found, strict=True)
+                return np.concatenate(sets), np.concatenate(intersections), np.concatenate(times)
+            if len(family) * rows.strides[0] > MOST_ROWS:
+                raise self._too_many(int(np.bincount(found[0][0]).max()), len(family))
+            other = np.arange(len(family)) - np.repeat(np.cumsum(before) - before, before)
+            other += (np.arange(len(rows)) - before).take(family)
+            shared = np.minimum(rows.take(other, axis=0), rows.take(family, axis=0))
+            largest = _largest(shared, family)
+            rows, family = shared.take(largest, axis=0), family.take(largest)
+            of, sign = of.take(family), -sign
+            found.append((of, rows, np.full(len(of), float(sign))))
 
     def _maximal(self, sets: np.ndarray, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes without a descendant in each set, latest first, (most, sets), −1 where there is none; and how many."""
+        """Nodes without a descendant in each set, the largest first, and the number of the set that each is of."""
         nodes = self._nodes.reshape(-1, sets.shape[1])
-        left, found = sets.copy(), []
-        everyone, active = np.arange(len(sets)), np.arange(len(sets))
-        number = np.zeros(len(sets), dtype=np.intp)
+        left, found, of = sets.copy(), [], []
+        active = np.arange(len(sets))
         while len(active):
             agent = left.argmax(axis=1)
-            top = left[everyone[: len(active)], agent].astype(np.intp) * len(self._known) + base[active] + agent
-            found.append(np.full(len(sets), -1))
-            found[-1][active] = top
-            number[active] += 1
+            top = left[np.arange(len(active)), agent].astype(np.intp) * len(self._known) + base[active] + agent
+            found.append(top)
+            of.append(active)
             left *= nodes.take(top, axis=0) < sets[active]
-            more = left.any(axis=1)
+            more = np.einsum("ij->i", _words(left) != 0)
             left, active = left[more], active[more]
-        return np.array(found), number
+        tops, number = np.concatenate(found), np.concatenate(of)
+        order = np.argsort((number << 32) - self._sizes.take(tops))
+        return tops[order], number[order]
 
     def _evaluate(self, sums: Sequence[_Sums]) -> None:
         """Sum up the values of the sets of one level."""
         from scipy.sparse import csr_array
 
-        places = [self._places(each.levels, each.keys) for each in sums]
-        different, which = np.unique(np.concatenate(places), return_inverse=True)
-        step = int(self._steps[sums[0].places[0]])
-        values = self._brought(different, step).reshape(len(different), -1)
+        different, which = np.unique(np.concatenate([each.terms for each in sums]), return_inverse=True)
+        values = self._brought(different, int(self._steps[sums[0].places[0]])).reshape(len(different), -1)
         begin = 0
-        for each, some in zip(sums, places, strict=True):
-            here = which[begin : begin + len(some)][each.which]
-            begin += len(some)
-            matrix = csr_array((each.times.astype(float), here, each.first), shape=(len(each.places), len(different)))
-            self._values[each.places] = (matrix @ values).reshape(-1, *self._values.shape[1:])
+        for places, terms, times in sums:
+            columns = which[begin : begin + len(terms)][times.indices]
+            begin += len(terms)
+            matrix = csr_array((times.data, columns, times.indptr), shape=(len(places), len(different)))
+            self._values[places] = (matrix @ values).reshape(-1, *self._values.shape[1:])
 
     def _brought(self, places: np.ndarray, step: int) -> np.ndarray:
         """Values brought forward to a step, in the order of their places."""
@@ -264,40 +252,39 @@ class GraphTogether:
             out[some] = brought_forward(out[some], self.sources, now + 1)
         return out
 
-    def _keys(self, hashes: np.ndarray, run: np.ndarray) -> np.ndarray:
-        """Tell rows of different runs apart."""
-        return (hashes ^ (run.astype(np.uint64) * _RANDOM[2, 0])) * _RANDOM[2, 1]
+    def _keys(self, rows: np.ndarray, run: np.ndarray) -> np.ndarray:
+        """Tell rows apart, and those of different runs."""
+        return (_hashes(rows) ^ (run.astype(np.uint64) * _RANDOM[2, 0])) * _RANDOM[2, 1]
 
-    def _places(self, levels: np.ndarray, keys: np.ndarray) -> np.ndarray:
-        """Where the values of sets stand, −1 where a set is new."""
-        out = np.full(len(keys), -1, dtype=np.intp)
+    def _placed(self, levels: np.ndarray, keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Places of the values of different sets, by level and key in order; and which of them are new."""
+        out, new = np.empty(len(keys), dtype=np.intp), []
         for level in np.flatnonzero(np.bincount(levels)).tolist():
-            if level in self._found:
-                known, places = self._found[level]
-                here = np.flatnonzero(levels == level)
-                at = np.searchsorted(known, keys[here])
-                at[at == len(known)] = 0
-                out[here] = np.where(known[at] == keys[here], places[at], -1)
-        return out
+            here = np.flatnonzero(levels == level)
+            if level not in self._found:
+                self._found[level] = np.zeros(0, dtype=np.uint64), np.zeros(0, dtype=np.intp)
+            (known, places), keys_now = self._found[level], keys[here]
+            at = np.searchsorted(known, keys_now)
+            within = np.minimum(at, len(known) - 1)
+            unknown = np.flatnonzero(known[within] != keys_now) if len(known) else np.arange(len(here))
+            fresh = np.arange(self._number, self._number + len(unknown))
+            if len(known):
+                out[here] = places[within]
+            out[here[unknown]] = fresh
+            at = at[unknown]
+            self._found[level] = np.insert(known, at, keys_now[unknown]), np.insert(places, at, fresh)
+            self._open(len(fresh), max(level, 1))
+            new.append(here[unknown])
+        return out, np.concatenate([np.zeros(0, dtype=np.intp), *new])
 
-    def _add(self, level: int, keys: np.ndarray, values: np.ndarray | float) -> np.ndarray:
-        """Places of new sets of a level, with their values."""
-        places = np.arange(self._number, self._number + len(keys))
-        self._number += len(keys)
+    def _open(self, number: int, step: int) -> None:
+        """Make room for some values more of a step."""
+        first, self._number = self._number, self._number + number
         if self._number > len(self._room):
-            room = np.empty((max(self._number, len(self._room) * 3 // 2), *self._room.shape[1:]))
-            room[: places[0]] = self._room[: places[0]]
-            self._room = room
-        self._room[places] = values
-        if level in self._found:
-            known, before = self._found[level]
-            keys_now, places_now = np.concatenate([known, keys]), np.concatenate([before, places])
-        else:
-            keys_now, places_now = keys, places
-        order = np.argsort(keys_now)
-        self._found[level] = keys_now[order], places_now[order]
-        self._steps = np.concatenate([self._steps, np.full(len(keys), max(level, 1))])
-        return places
+            more = max(self._number, len(self._room) * 3 // 2) - len(self._room)
+            self._room = np.concatenate([self._room, np.empty((more, *self._room.shape[1:]))])
+            self._steps = np.concatenate([self._steps, np.empty(more, dtype=np.intp)])
+        self._steps[first : self._number] = step
 
     def _too_many(self, heard: int, found: int) -> TooManyError:
         return TooManyError(
@@ -308,48 +295,26 @@ class GraphTogether:
         )
 
 
-def _listed(tops: Sequence[np.ndarray]) -> _Terms:
-    """Terms of sets with few maximal nodes: every intersection, then equal ones together."""
-    rows, times = tops[0][None], np.ones(1, dtype=np.intp)
-    for each in tops[1:]:
-        rows = np.concatenate([rows, np.minimum(rows, each), each[None]])
-        times = np.concatenate([times, -times, [1]])
-    sets = np.arange(len(tops[0]))
-    return _together(
-        _words(rows.reshape(-1, rows.shape[-1])), np.repeat(times, len(sets)), np.tile(sets, len(times)), rows.dtype
-    )
+def _largest(rows: np.ndarray, family: np.ndarray) -> np.ndarray:
+    """Rows that lie in no other of their family, one of equal ones and none that is empty: by family, largest first."""
+    sizes = _sizes(rows)
+    left, found = np.flatnonzero(sizes), [np.zeros(0, dtype=np.intp)]
+    while len(left):
+        of = family.take(left)
+        starts = np.flatnonzero(np.concatenate([[True], of[1:] != of[:-1]]))
+        # a largest one lies in no other
+        found.append(np.maximum.reduceat(sizes.take(left) << 32 | left, starts) & (1 << 32) - 1)
+        largest = np.repeat(found[-1], np.diff(starts, append=len(left)))
+        some = rows.take(left, axis=0)
+        beyond = _words(np.minimum(rows.take(largest, axis=0), some)) != _words(some)
+        left = left[np.einsum("ij->i", beyond)]
+    largest = np.concatenate(found)
+    return largest[np.argsort(family[largest], kind="stable")]
 
 
-def _joined(terms: _Terms, tops: np.ndarray) -> _Terms:
-    """Terms of sets with one maximal node more each."""
-    of = terms.of
-    shared = _words(np.minimum(terms.rows, _words(tops).take(of, axis=0).view(tops.dtype)))
-    rows = np.concatenate([_words(terms.rows), shared, _words(tops)])
-    times = np.concatenate([terms.times, -terms.times, np.ones(len(tops), dtype=np.intp)])
-    return _together(rows, times, np.concatenate([of, of, np.arange(len(tops))]), tops.dtype)
-
-
-def _together(words: np.ndarray, times: np.ndarray, of: np.ndarray, kind: np.dtype) -> _Terms:
-    """Terms of sets, of each set equal ones added up."""
-    keys = of.astype(np.uint64) << TOLD | _hashes(words) >> np.uint64(64) - TOLD
-    order = np.argsort(keys)
-    keys = keys.take(order)
-    starts = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
-    total, keys = np.add.reduceat(times.take(order), starts), keys.take(starts)
-    # where nothing is shared the hash is 0
-    kept = np.flatnonzero((total != 0) & (keys << np.uint64(64) - TOLD != 0))
-    rows = words.take(order.take(starts.take(kept)), axis=0).view(kind)
-    return _Terms(keys.take(kept), total.take(kept), rows)
-
-
-def _different(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where one of each of the different keys is, in their order, and the number of every key among them."""
-    order = np.argsort(keys)
-    sorted_keys = keys[order]
-    new = np.concatenate([[True], sorted_keys[1:] != sorted_keys[:-1]])
-    which = np.empty(len(keys), dtype=np.intp)
-    which[order] = np.cumsum(new) - 1
-    return order[new], which
+def _sizes(rows: np.ndarray) -> np.ndarray:
+    """Number of nodes in each set."""
+    return np.einsum("ij->i", rows, dtype=np.uint32, casting="unsafe").astype(np.intp)
 
 
 def _words(rows: np.ndarray) -> np.ndarray:
@@ -357,22 +322,13 @@ def _words(rows: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(rows).view(np.uint64)
 
 
-def _hashes(words: np.ndarray) -> np.ndarray:
-    """One number of 64 bits for every row of words, 0 for the empty one."""
+def _hashes(rows: np.ndarray) -> np.ndarray:
+    """One number of 64 bits for every row."""
+    words = _words(rows)
     one, other = _RANDOM[:2, : words.shape[1]]
-    half = np.uint64(32)
-    if words.shape[1] > NARROW:
-        mixed = words * one
-        mixed ^= mixed >> half
-        mixed *= other
-        total = mixed.sum(axis=1)
-    else:
-        total = np.zeros(len(words), dtype=np.uint64)
-        for column, a, b in zip(words.T, one, other, strict=True):
-            mixed = column * a
-            mixed ^= mixed >> half
-            mixed *= b
-            total += mixed
-    total ^= total >> half
+    mixed = words * one
+    mixed ^= mixed >> np.uint64(32)
+    total = np.einsum("ij,j->i", mixed, other)
+    total ^= total >> np.uint64(32)
     total *= _RANDOM[2, 2]
     return total

@@ -52,8 +52,8 @@ def large(quick: bool) -> list[tuple[str, ...]]:
     """Mean over the agents at the last step."""
     work = [
         ("20 agents, 20 steps", 20, 9.5, 20, 250, "local-fusion-graph"),
-        ("60 agents, 10 steps", 60, 5.5, 10, 20, "local-fusion-graph"),
-        ("500 agents, 10 steps", 500, 6.0, 10, 4, "local-fusion-graph"),
+        ("60 agents, 10 steps", 60, 5.5, 10, 24, "local-fusion-graph"),
+        ("500 agents, 10 steps", 500, 6.0, 10, 2, "local-fusion-graph"),
         ("500 agents, 20 steps, naive", 500, 6.0, 20, 30, "naive"),
         ("500 agents, 20 steps, intersection", 500, 6.0, 20, 30, "covariance-intersection"),
         ("100 agents, 20 steps, optimum", 100, 6.0, 20, 400, "optimal"),

@@ -107,8 +107,6 @@ def test_how_many_are_at_hand_changes_nothing(estimator, monkeypatch):
     expected = drawn(given, monkeypatch, 0, **how)
     for room, name, value in (
         (pedigrees, "AT_A_TIME", 5),
-        (pedigrees, "LISTED", 1),
-        (pedigrees, "NARROW", 0),
         (together, "MOST_NUMBERS", 3000),
         (monte_carlo, "MOST_TOGETHER", 2),
         (monte_carlo, "DRAWN", 3),
@@ -131,7 +129,7 @@ def test_states_given_data(monkeypatch):
 def test_what_would_not_fit_is_refused_with_the_number(monkeypatch):
     monkeypatch.setattr(pedigrees, "MOST_ROWS", 1 << 16)
     monkeypatch.setattr(pedigrees, "AT_A_TIME", 1)
-    expected = r"of 1\d received estimates is made of up to 2\^1\d = .* intersections .* --method optimal"
+    expected = r"of (\d+) received estimates is made of up to 2\^\1 = .* intersections .* --method optimal"
     with pytest.raises(TooManyError, match=expected):
         sf.predict(sf.load_scenario(agents=30, steps=3), [0.6], method="monte-carlo", runs=2)
 
