@@ -53,7 +53,8 @@ class Checker:
             self.note(path, expected, "a number beyond floating point")
             return None
         except (ValueError, TypeError):
-            self.note(path, expected, f"{shown(value)} (rows of different length?)")
+            uneven = "" if isinstance(value, str) else " (rows of different length?)"
+            self.note(path, expected, f"{shown(value)}{uneven}")
             return None
         if not np.isfinite(array).all():
             self.note(path, expected, "a value that is not finite (NaN or infinity)")

@@ -166,7 +166,7 @@ def test_axes_of_ones_own():
         (lambda: sf.predict(MINE, runz=5), TypeError, "unexpected keyword argument 'runz' .did you mean 'runs'"),
         (lambda: sf.predict(MINE, method="simplifed"), sf.UsageError, "method: expected one of .* got 'simplifed' .did you mean 'simplified'"),
         (lambda: sf.predict(MINE, "half"), sf.UsageError, "link: expected link probabilities"),
-        (lambda: sf.sensitivity(MINE, "general"), sf.UsageError, "link: expected a probability or a 3×3 matrix, got 'general'"),
+        (lambda: sf.sensitivity(MINE, "general"), sf.UsageError, "link: expected a probability, a 3×3 matrix of them .*, got 'general'$"),
         (lambda: sf.least_link(MINE, "low"), sf.UsageError, "target: expected a finite number of at least 0, got 'low'"),
         (lambda: sf.agents_needed(MINE, 3.0, "half"), sf.UsageError, "link: expected a probability between 0 and 1, got half"),
         (lambda: sf.load_scenario(MINE, agnets=3), TypeError, "unexpected keyword argument 'agnets' .did you mean 'agents'"),
