@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from time import monotonic
 from typing import Any, NamedTuple
 
@@ -188,13 +189,13 @@ def _with_sensitivity(asked: PageInput) -> Picture:
     drawn = picture(asked)
     at = asked.link if asked.kind == "link" else None
     found = sensitivity(asked.scenario, at, of=asked.metric, agent=asked.agent, method=SIMPLIFIED)
-    worth = {
-        (receiver - 1, sender - 1): float(slope)
-        for (sender, receivers), slope in zip(found.links, found.derivative, strict=True)
-        for receiver in receivers
-    }
-    first = {(r - 1, found.links[i][0] - 1) for i in found.first for r in found.links[i][1]}
-    return drawn.weighed(worth, first)
+    pairs = [[(receiver - 1, sender - 1) for receiver in receivers] for sender, receivers in found.links]
+
+    def by_pair(values: np.ndarray) -> dict[tuple[int, int], float]:
+        return {pair: float(value) for some, value in zip(pairs, values, strict=True) for pair in some}
+
+    first = frozenset(pair for i in found.first for pair in pairs[i])
+    return replace(drawn, worth=by_pair(found.derivative), lacking=by_pair(found.lacking), first=first)
 
 
 def _load(asked: PageInput) -> PageAnswer:

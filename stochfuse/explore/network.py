@@ -5,7 +5,7 @@ Each way has an arc of its own, bent to one side of the chord, so that it can be
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -35,6 +35,7 @@ class Picture:
     step : the step that is drawn, where links vary with the step; else None.
     errors : (agents,) each agent's own number, of the simplified formulation at the last step; NaN where it has none.
     worth : dE/dµ of links, by (receiver, sender).
+    lacking : what each would take off if it were perfect, to first order.
     first : the links to improve first.
     """
 
@@ -45,11 +46,8 @@ class Picture:
     step: int | None
     errors: np.ndarray
     worth: dict[tuple[int, int], float] = field(default_factory=dict)
+    lacking: dict[tuple[int, int], float] = field(default_factory=dict)
     first: frozenset[tuple[int, int]] = frozenset()
-
-    def weighed(self, worth: dict[tuple[int, int], float], first: set[tuple[int, int]]) -> Picture:
-        """Return the same with what links are worth."""
-        return replace(self, worth=worth, first=frozenset(first))
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
@@ -72,11 +70,10 @@ class Picture:
         return f"{self.names[pair[1]]} → {self.names[pair[0]]}"
 
     def mended(self) -> str:
-        """Say which link has most to gain: the slope times what its µ lacks of 1; empty where none differs."""
-        gains = {pair: -slope * (1.0 - float(self.link[pair])) for pair, slope in self.worth.items()}
-        most = max(gains.values(), default=0.0)
-        best = [self.name(pair) for pair, gain in gains.items() if gain >= most * (1 - 1e-6)]
-        if most <= 0 or len(best) == len(gains):
+        """Say which link has most to gain; empty where none differs."""
+        most = max(self.lacking.values(), default=0.0)
+        best = [self.name(pair) for pair, gain in self.lacking.items() if gain >= most * (1 - 1e-6)]
+        if most <= 0 or len(best) == len(self.lacking):
             return ""
         return f" To mend first: {', '.join(best)}; perfect, it would take about {most:.3g} off (to first order)."
 

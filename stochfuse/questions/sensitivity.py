@@ -84,6 +84,11 @@ class Sensitivity(Result):
     prediction: Prediction
 
     @property
+    def lacking(self) -> np.ndarray:
+        """What each link would take off E if it were perfect, to first order: −dE/dµ (1 − µ), shape (links,)."""
+        return -self.derivative * (1.0 - self.link)
+
+    @property
     def first(self) -> tuple[int, ...]:
         """Links to improve first: the one with the largest gain and those that tie with it; none if none gains."""
         can = np.flatnonzero((self.link < 1.0) & (self.derivative < 0.0))

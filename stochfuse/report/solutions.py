@@ -262,7 +262,7 @@ def sensitivity_sheet(found: Sensitivity, digits: int = 5) -> SolutionSheet:
     asked = found.question
     how = "exact derivatives of a polynomial in each link's µ" if found.exact else "numerical derivatives"
     error = np.max(found.error)
-    answer = (*_advice(found), f"{how}; estimated error at most {error:.1g}")
+    answer = (*_advice(found), *_mending(found), f"{how}; estimated error at most {error:.1g}")
     rows, records = [], []
     for rank, i in enumerate(found.order, start=1):
         sender, to = found.links[i][0], receivers(found, int(i))
@@ -279,6 +279,7 @@ def sensitivity_sheet(found: Sensitivity, digits: int = 5) -> SolutionSheet:
                 **_link(found, int(i)),
                 "link": float(found.link[i]),
                 "derivative": float(found.derivative[i]),
+                "gain_if_perfect": float(found.lacking[i]),
                 "estimated_error": float(found.error[i]),
             }
             for i in found.order
@@ -293,6 +294,24 @@ def receivers(found: Sensitivity, i: int) -> str:
     """Whom a link reaches: an agent's number, or all."""
     heard = found.links[i][1]
     return "all" if found.question.scenario.network.architecture == "broadcast" else str(heard[0])
+
+
+def _named(found: Sensitivity, i: int) -> str:
+    """A link in words, its agents by number and name."""
+    sender, to = found.links[i][0], receivers(found, i)
+    names = found.question.scenario.network.names
+    if not names:
+        return f"{sender} to {to}"
+    return f"{sender} ({names[sender - 1]}) to {to}" + (f" ({names[int(to) - 1]})" if to != "all" else "")
+
+
+def _mending(found: Sensitivity) -> Sequence[str]:
+    """Which link has most to gain, where that is another than the one of the largest slope."""
+    most = int(np.argmax(found.lacking))
+    if found.lacking[most] <= 0 or most in found.first:
+        return ()
+    gain = f"about {found.lacking[most]:.3g}, to first order"
+    return (f"Perfect, the link from agent {_named(found, most)} would lower it most: by {gain}",)
 
 
 def _link(found: Sensitivity, i: int) -> dict[str, Any]:
@@ -312,7 +331,7 @@ def _advice(found: Sensitivity) -> Sequence[str]:
         if found.value
         else f"{gain:.3g}"
     )
-    names = [f"from agent {found.links[i][0]} to {receivers(found, i)}" for i in found.first]
+    names = [f"from agent {_named(found, i)}" for i in found.first]
     if len(names) == len(found.links) > 1:
         return (f"No link is better to improve than another: +{IMPROVEMENT:g} on any one lowers the value by {worth}",)
     which = f"the link {names[0]}" if len(names) == 1 else f"one of the {len(names)} links {', '.join(names)}"

@@ -362,6 +362,15 @@ def test_simplified_sensitivities_of_unlike_agents(agent):
         f"Improve first: the link from agent {best[0]} to {best[1][0]}; +0.01 there lowers"
         in sensitivity_sheet(found).answer[0]
     )
+    most = max(range(len(found.links)), key=lambda i: -found.derivative[i] * (1 - found.link[i]))
+    sheet = sensitivity_sheet(found)
+    told = [line for line in sheet.answer if line.startswith("Perfect, the link from agent ")]
+    assert len(told) == (most not in found.first)
+    if told:
+        (sender, (receiver,)) = found.links[most]
+        assert told[0].startswith(f"Perfect, the link from agent {sender} to {receiver} would lower it most: by about ")
+    gains = [link["gain_if_perfect"] for link in sheet.facts["links"]]
+    assert max(gains) == pytest.approx(-found.derivative[most] * (1 - found.link[most]), rel=1e-12)
 
 
 @pytest.mark.parametrize(("of", "rate"), [("std:x1", None), ("det", None), ("max-eig", None)])
