@@ -343,9 +343,8 @@ def _fill(
 
 def _kind(asked: _Points, found: Sequence[Prediction]) -> Kind:
     """Return method, estimator and nature of answers: of several quantities the nature of the least certain."""
-    certain = ("exact", "sampled", "approximate", "bound")
     own = next((p for p in found if p.quantity != OPTIMAL), found[0])
-    return asked.method, own.estimator, max((p.nature for p in found), key=certain.index)
+    return asked.method, own.estimator, max((p.nature for p in found), key=NATURES.index)
 
 
 def _check(p: Prediction, rows: np.ndarray, items: np.ndarray, group: _Group) -> None:
