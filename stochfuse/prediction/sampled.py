@@ -214,7 +214,7 @@ def _spread(of: Callable[[Moments], np.ndarray], mean: Moments, deviations: Mome
     )
     slope = (above - below) / (2 * STEP)
     square = float((slope**2).mean())
-    return square / (len(slope) - 1), float((slope**3).mean()) / square**1.5 if square > 0 else 0.0
+    return square / (len(slope) - 1), float(((slope / np.sqrt(square)) ** 3).mean()) if square > 0 else 0.0
 
 
 def _constant(m: np.ndarray | None) -> bool:

@@ -423,7 +423,7 @@ def check(failures: dict[tuple[str, str], str], codes: Counter[int]) -> None:
     total = codes.total()
     assert codes[0] > 0.25 * total, codes
     assert codes[2] > 0.25 * total, codes
-    assert codes[3] > 0, codes
+    assert codes[3] > 0 or total < LINES, codes  # some in a thousand have no answer
 
 
 @pytest.mark.slow
