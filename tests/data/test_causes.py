@@ -130,6 +130,7 @@ def test_what_begins_late_is_looked_at():
     assert "explains the numbers of steps up to 12 (of 14); nearest" in summary(causes)
 
 
+@pytest.mark.slow
 def test_what_explains_the_first_steps_is_tried_on_all():
     """R of what is measured a quarter of what the filters are told: their claims are right."""
     data = table(partial(naive, noise=0.25), [0.5], 2000, np.random.default_rng(0))

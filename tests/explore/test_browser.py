@@ -59,7 +59,8 @@ def url(small):
     with served(small) as (server, url):
         yield url
         server.terminate()
-        assert "Traceback" not in server.stderr.read()
+        said = server.stderr.read()
+        assert "Traceback" not in said, said
 
 
 @pytest.fixture(scope="module")

@@ -42,7 +42,8 @@ def test_two_agents_by_hand():
     assert s.network.link[0, 1] == 0.6
 
 
-@pytest.mark.parametrize("packets", [pytest.param(200, marks=pytest.mark.slow), 2000])
+@pytest.mark.slow
+@pytest.mark.parametrize("packets", [200, 2000])
 def test_draws_and_derivatives_agree_where_much_is_known(packets):
     s = counted(np.random.default_rng(1), packets)
     drawn = sf.predict(s, method="optimal", interval="95%")
@@ -74,7 +75,8 @@ def coverage(method, logs, packets, true=TRUE):
     return inside / logs
 
 
-@pytest.mark.parametrize("method", ["simplified", pytest.param("optimal", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["simplified", "optimal"])
 def test_intervals_hold_the_true_value_as_often_as_they_say(method):
     assert 0.91 <= coverage(method, 200, 60) <= 0.98
 

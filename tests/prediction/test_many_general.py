@@ -320,6 +320,7 @@ KINDS = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @given(st.lists(st.tuples(st.sampled_from(range(len(KINDS))), st.sampled_from(["general", "naive", "optimal"]), st.booleans()), min_size=2, max_size=12))  # fmt: skip
 @settings(max_examples=20, deadline=None)
 def test_what_is_kept_of_one_scenario_is_not_taken_for_another(asked):

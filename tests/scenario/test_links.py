@@ -34,7 +34,7 @@ def log_of(rows):
 
 
 @there
-@pytest.mark.parametrize("name", ["noise-0dbm", "noise-minus5dbm"])
+@pytest.mark.parametrize("name", [pytest.param("noise-0dbm", marks=pytest.mark.slow), "noise-minus5dbm"])
 def test_a_real_log_is_counted(name):
     path = DATA / "orbit" / f"{name}.csv"
     sent, received = defaultdict(set), defaultdict(set)

@@ -213,7 +213,7 @@ def test_kills_at_random_moments(name, suffix, workers, rounds, tmp_path, quiet,
     assert names == ["log", output.name, f"{output.name}.study.json", "mine.toml"]
 
 
-@pytest.mark.parametrize("workers", ["1", "2"])
+@pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.slow)])
 def test_ctrl_c_ends_it_and_says_what_is_kept(workers, tmp_path, quiet):
     study, output = tmp_path / "mine.toml", tmp_path / "mine.csv"
     study.write_text(SAMPLED)
