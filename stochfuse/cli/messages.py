@@ -11,7 +11,7 @@ from stochfuse.cli.options import (
     WORK,
     Changes,
     MetricOption,
-    Outcomes,
+    OutcomeOptions,
     OverOption,
     ScenarioArgument,
     Written,
@@ -86,7 +86,7 @@ def messages(
     method: Annotated[
         str, choice((EXACT, MONTE_CARLO), "exact; or monte-carlo, for networks too large for it; default: exact.", WORK)
     ] = EXACT,
-    outcomes: Outcomes = Outcomes(),
+    outcomes: OutcomeOptions = OutcomeOptions(),
     to: Written = Written(),
 ) -> None:
     """Tabulate message load: how many nodes new to an agent the messages of a step bring it.
@@ -141,7 +141,7 @@ def _by_protocol(
     window: tuple[int | None, int | None],
     agent: str,
     shown: LoadOptions,
-    outcomes: Outcomes,
+    outcomes: OutcomeOptions,
     to: Written,
 ) -> None:
     """What live agents send, and what it is worth to them."""

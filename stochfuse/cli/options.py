@@ -231,7 +231,7 @@ MaxGraphsOption = Annotated[
 
 
 @dataclass(frozen=True)
-class Outcomes:
+class OutcomeOptions:
     """How outcomes are listed or drawn."""
 
     runs: Annotated[
@@ -252,7 +252,7 @@ class Outcomes:
 
 
 @dataclass(frozen=True)
-class Averaging(Outcomes):
+class Averaging(OutcomeOptions):
     """How chance is averaged: outcomes, and what only some engines and estimators have."""
 
     precision: Annotated[

@@ -114,7 +114,7 @@ class RobotOptions:
 
 
 @dataclass(frozen=True)
-class Estimates(Beside):
+class EstimatesOptions(Beside):
     """A report on standard output, and the estimates in a file."""
 
     output: Annotated[
@@ -169,7 +169,7 @@ def run(
     robots: RobotOptions = RobotOptions(),
     seed: Annotated[int, option("Of arrivals that are drawn; default: 1.", NETWORK, min=0, metavar="N")] = 1,
     estimating: Estimating = Estimating(),
-    to: Estimates = Estimates(),
+    to: EstimatesOptions = EstimatesOptions(),
 ) -> None:  # fmt: skip
     """Run estimators on measurements; show realised, claimed and predicted errors, and whether claims are consistent.
 

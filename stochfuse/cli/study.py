@@ -65,7 +65,7 @@ class Looked:
 
 
 @dataclass(frozen=True)
-class Result(Beside):
+class StudyOptions(Beside):
     """A summary on standard output, and the result in a file."""
 
     output: Annotated[
@@ -85,7 +85,7 @@ def study(
     ] = None,
     restart: Annotated[bool, option("Begin anew, and replace a result that is there.", WORK, "--restart")] = False,
     looked: Looked = Looked(),
-    to: Result = Result(),
+    to: StudyOptions = StudyOptions(),
 ) -> None:
     """Predict many points: a grid, a list or a Latin hypercube over scenario keys and methods.
 

@@ -1,10 +1,10 @@
 """A recursion of matrices, the same for each of many items, compiled when there is enough of it.
 
-The step is run once on arrays of `Term`, which write down what is done to them: no equation is written a second time.
-That list, in the language of LLVM, becomes the body of a loop over groups of `LANES` neighbouring items; an operation
-is one vector instruction, a product and the sum that it goes into are one.  All steps of a group come before the next
-group: what it goes by is read once and stays in registers and the nearest cache, where NumPy passes memory at every
-operation.
+The step is run once on arrays of `TracedNumber`, which write down what is done to them: no equation is written a second
+time. That list, in the language of LLVM, becomes the body of a loop over groups of `LANES` neighbouring items; an
+operation is one vector instruction, a product and the sum that it goes into are one. All steps of a group come before
+the next group: what it goes by is read once and stays in registers and the nearest cache, where NumPy passes memory at
+every operation.
 
 Needs the package llvmlite (extra `compiled`), whose import takes 0.1 s once, and then 0.02 to 0.5 s for 2 to 9 states;
 nothing is kept on disk.  Without it answers are the same up to rounding.  The environment variable STOCHFUSE_COMPILED
@@ -37,34 +37,34 @@ _NUMBERS, _PLACES, _MASK, _POINTERS = (f"<{LANES} x {kind}>" for kind in ("doubl
 _GATHER, _STORE = f"@llvm.masked.gather.v{LANES}f64.v{LANES}p0", f"@llvm.masked.store.v{LANES}f64.p0"
 
 Entries = Sequence[tuple[int, int]]
-Step = Callable[..., tuple[Sequence["Term"], Sequence["Term"]]]
+Step = Callable[..., tuple[Sequence["TracedNumber"], Sequence["TracedNumber"]]]
 
 
-class Term:
+class TracedNumber:
     """A number of every item that is not known yet: arithmetic on it is written down, the same only once."""
 
     def __init__(self, name: str, written: dict[str, str]) -> None:
         self.name, self._written = name, written
 
-    def _write(self, text: str) -> Term:
-        return Term(self._written.setdefault(text, f"%t{len(self._written)}"), self._written)
+    def _write(self, text: str) -> TracedNumber:
+        return TracedNumber(self._written.setdefault(text, f"%t{len(self._written)}"), self._written)
 
-    def __add__(self, other: Term) -> Term:
+    def __add__(self, other: TracedNumber) -> TracedNumber:
         return self._write(f"fadd contract {_NUMBERS} {self.name}, {other.name}")
 
-    def __radd__(self, nothing: int) -> Term:
+    def __radd__(self, nothing: int) -> TracedNumber:
         return self  # NumPy begins its sums at 0
 
-    def __sub__(self, other: Term) -> Term:
+    def __sub__(self, other: TracedNumber) -> TracedNumber:
         return self._write(f"fsub contract {_NUMBERS} {self.name}, {other.name}")
 
-    def __mul__(self, other: Term) -> Term:
+    def __mul__(self, other: TracedNumber) -> TracedNumber:
         return self._write(f"fmul contract {_NUMBERS} {self.name}, {other.name}")
 
-    def __rtruediv__(self, number: float) -> Term:
+    def __rtruediv__(self, number: float) -> TracedNumber:
         return self._write(f"fdiv {_NUMBERS} splat (double {number!r}), {self.name}")
 
-    def largest(self, other: Term) -> Term:
+    def largest(self, other: TracedNumber) -> TracedNumber:
         """Return the larger of the two, `other` where one is no number."""
         larger = self._write(f"fcmp ogt {_NUMBERS} {self.name}, {other.name}")
         return self._write(f"select {_MASK} {larger.name}, {_NUMBERS} {self.name}, {_NUMBERS} {other.name}")
@@ -185,7 +185,7 @@ def _text(place: Sequence[int], watched: int, read: Sequence[int], common: Colle
     written: dict[str, str] = {}
 
     def terms(name: str, size: int) -> np.ndarray:
-        return np.array([Term(f"%{name}.{i}", written) for i in range(size)], dtype=object)
+        return np.array([TracedNumber(f"%{name}.{i}", written) for i in range(size)], dtype=object)
 
     now, seen = terms("now", read[0]), terms("seen", watched)
     becomes, then = step(now, seen, *(terms(f"m{j}", size) for j, size in enumerate(read[1:], start=1)))
