@@ -61,6 +61,7 @@ import numpy as np
 from stochfuse.engines.events import alike
 from stochfuse.engines.progress import listener
 from stochfuse.errors import UsageError
+from stochfuse.kalman.algebra import NUMPY
 from stochfuse.kalman.kernel import (
     AsTheyAre,
     Estimate,
@@ -70,7 +71,6 @@ from stochfuse.kalman.kernel import (
     posterior_gain,
     predict,
     predict_factor,
-    update,
     update_factor,
 )
 from stochfuse.scenario.model import Model, Sensor
@@ -197,7 +197,7 @@ class _Classes:
             return there
         return there & np.any(link.reshape(-1, *link.shape[-2:]) > 0, axis=0)[self.pairs]
 
-    @property
+    @cached_property
     def sizes(self) -> np.ndarray:
         """How many agents each class has."""
         return np.array([len(c) for c in self.members])
@@ -247,12 +247,14 @@ class _Classes:
         after[:, :, 1:] = state[:, :-1]
         after[:, :, -1] += state[:, -1]
         after[:, joining, 0] += joined.astype(state.dtype)
-        return joining, self._alike(after) if self.ages > 1 else after
+        return joining, self._alike(after)
 
     def _alike(self, states: np.ndarray) -> np.ndarray:
         """Give one age to all members whose ages no longer matter: nobody is left whom they may hear, or who is heard
         by some older one too.
         """
+        if self.ages == 1:
+            return states
         inside = states.sum(axis=2)
         waiting = inside < self.sizes
         if self.network.architecture == "broadcast":
@@ -407,28 +409,25 @@ class LosslessFilter(NamedTuple):
 
     def start(self, counts: np.ndarray) -> AlongPath:
         """Estimate from so many agents' initial ones, and what it leaves of the error."""
-        x = np.zeros((self.model.dimension, 1)) if self.error is None else self.error
         first = self.P0 if self.shared or self.first is not None else self.P0 / counts.sum()
         P = (first if self.first is None else self.first[tuple(counts.tolist())])[None]
-        return AlongPath(np.broadcast_to(x, (*P.shape[:-1], 1)), P if self.scalar else self.numbers.factor(P))
+        x = None if self.error is None else np.broadcast_to(self.error, (*P.shape[:-1], 1))
+        return AlongPath(x, P if self.scalar else self.numbers.factor(P))
 
     def after(self, before: AlongPath, counts: np.ndarray, step: int) -> AlongPath:
         """Predict to a step and take in the measurements of so many agents of each kind; of errors, if there are.
 
-        Of one kind, the numbers may be a stack (..., 1) that goes with the estimate's.
+        The numbers may be a stack (..., kinds) that goes with the estimate's.
         """
         F, Q = at_step(self.model.F, step), at_step(self.model.Q, step)
         given = self.numbers
         sensors = [(given.rounded(at_step(s.H, step)), given.noise(at_step(s.R, step))) for s in self.sensors]
-        arrived = [(H, R, n) for (H, R), n in zip(sensors, np.moveaxis(counts, -1, 0), strict=True) if n.any()]
+        arrived = [(H, R, n) for kind, (H, R) in enumerate(sensors) if (n := counts[..., kind]).any()]
         if self.scalar:
-            estimate = predict(Estimate(*before), F, Q)
-            for H, R, n in arrived:
-                J = H.T @ np.linalg.solve(R, H)  # all that a measurement of a scalar says, whatever its size
-                if J.any():
-                    R = 1.0 / (J * _at_least(n)[..., None, None])
-                    estimate = update(estimate, np.ones((1, 1)), R, np.zeros((1, 1)))
-            return AlongPath(*estimate)
+            x, P = predict(Estimate(*before), F, Q)
+            # all that measurements of a scalar say, whatever their size
+            gained = 1.0 + P * sum(n[..., None, None] * (H.T @ NUMPY.solve(R, H)) for H, R, n in arrived)
+            return AlongPath(None if x is None else x / gained, P / gained)
         x, L = before.x, given.rounded(predict_factor(given.rounded(before.root), F, given.factor(Q)))
         x = x if x is None else F @ x
         for H, R, n in arrived:
@@ -480,17 +479,12 @@ class TooManyPathsError(UsageError):
     """More paths than can be gone through one by one."""
 
 
-class Class(NamedTuple):
-    """Paths that end with the same counts: what each carries, and weight (rows, states of those counts, paths)."""
-
-    carried: AlongPath
-    weight: np.ndarray
-
-
 def by_counts(contacts: Contacts) -> tuple[np.ndarray, list[np.ndarray]]:
     """Different counts (classes, kinds), and the states of each."""
-    counts, class_of = np.unique(contacts.held, axis=0, return_inverse=True)
-    return counts, [np.flatnonzero(class_of.ravel() == c) for c in range(len(counts))]
+    states: dict[tuple[int, ...], list[int]] = {}
+    for state, held in enumerate(contacts.held.tolist()):
+        states.setdefault(tuple(held), []).append(state)
+    return np.array(sorted(states)), [np.array(states[held]) for held in sorted(states)]
 
 
 def blocks_of_rows(contacts: Contacts, rows: int) -> Iterator[slice]:
@@ -546,14 +540,16 @@ def expected_optimum(given: LosslessFilter, contacts: Contacts, steps: int, rows
 
 def joined(found: Sequence[tuple[list[np.ndarray], int]]) -> Chain:
     """Return what `over_paths` found for all blocks of rows."""
-    P, b, M = (np.concatenate([moments[m] for moments, _ in found]) for m in range(3))
+    P, *errors = (np.concatenate(moment) for moment in zip(*(moments for moments, _ in found), strict=True))
+    b, M = errors or (np.zeros((*P.shape[:-1], 1)), P)
     return Chain(P, b, M, np.zeros(P.shape[:2]), found[0][1])
 
 
 def over_paths(
     given: LosslessFilter, contacts: Contacts, steps: int, some: slice | np.ndarray
 ) -> tuple[list[np.ndarray], int]:
-    """E[P], E[b] and E[P + b bᵀ] of some rows, each (rows, steps, groups, …), and the number of paths.
+    """E[P] and, where errors are followed, E[b] and E[P + b bᵀ] of some rows, each (rows, steps, groups, …); and the
+    number of paths.
 
     Parameters
     ----------
@@ -565,62 +561,98 @@ def over_paths(
         If there are more than `MOST_PATHS`.
     """
     counts, states = by_counts(contacts)
-    classes: dict[int, Class] = {}
-    out: list[list[np.ndarray]] = [[], [], []]
-    paths, before = 0, np.empty(0)
+    first = given.begins(counts)
+    single = len(states) == len(contacts.held)
+    paths = _PathsOfStates(states, first) if single else _PathsOfCounts(states, first)
+    x, roots = zip(*(given.start(counts[c]) for c in first), strict=True)
+    carried = AlongPath(None if x[0] is None else np.concatenate(x), np.concatenate(roots))
+    out, before = [], np.empty(0)
     for step, T in enumerate(transitions(contacts, steps, some), start=1):
-        if step == 1:
-            ones = {c: np.ones((len(T), len(states[c]), 1)) for c in given.begins(counts)}
-            classes = {c: Class(given.start(counts[c]), weight) for c, weight in ones.items()}
-        else:
-            classes = _grown(given, classes, before, counts, states, step)
-        paths = sum(c.weight.shape[2] for c in classes.values())
-        for place, moment in enumerate(_closed(given, classes, T, states, contacts.starts)):
-            out[place].append(moment)
+        if step > 1:
+            parent = paths.grow(before)
+            n = counts[paths.counts]
+            n = n if carried.root.ndim == 3 else n[:, None]  # a filter for each row
+            x = None if carried.x is None else carried.x[parent]
+            carried = given.after(AlongPath(x, carried.root[parent]), n, step)
+        weight, P, x = paths.closing(T, contacts.starts), given.covariance(carried), carried.x
+        moments = (P,) if x is None else (P, x, P + x @ np.swapaxes(x, -1, -2))
+        out.append([_over(weight, moment) for moment in moments])
         before = T
-    return [np.stack(moment, axis=1) for moment in out], paths
+    return [np.stack(moment, axis=1) for moment in zip(*out, strict=True)], len(carried.root)
 
 
-def _closed(
-    given: LosslessFilter, classes: dict[int, Class], T: np.ndarray, states: list[np.ndarray], starts: Sequence[int]
-) -> tuple[Any, Any, Any]:
-    """E[P], E[b] and E[P + b bᵀ] over the paths, each (rows, groups, …)."""
-    P, b, M = 0.0, 0.0, 0.0
-    for c, (carried, weight) in classes.items():
-        last = closing(T, starts, states[c], weight)
-        x, now = carried.x, given.covariance(carried)
-        P, b, M = P + _over(last, now), b + _over(last, x), M + _over(last, now + x @ np.swapaxes(x, -1, -2))
-    return P, b, M
+class _PathsOfStates:
+    """Paths and their weights (rows, paths), where every state has counts of its own.
+
+    Parameters
+    ----------
+    states : states of the different counts.
+    counts : place of those that every path begins with, and ends with later.
+    """
+
+    def __init__(self, states: Sequence[np.ndarray], counts: Sequence[int]) -> None:
+        self.counts, self._state, self._weight = np.array(counts), np.concatenate(states), np.ones((1, len(counts)))
+
+    def grow(self, T: np.ndarray) -> np.ndarray:
+        """Let all counts follow that may, and return which path each was before."""
+        now = self._state[self.counts]
+        after, parent = np.asarray(T.any(axis=0))[self._state][:, now].nonzero()
+        check_size(0, len(T) * len(after))
+        weight = self._weight[:, parent] * T[:, self._state[after], now[parent]]
+        alive = weight.any(axis=0)
+        if not alive.all():
+            after, parent, weight = after[alive], parent[alive], weight[:, alive]
+        self.counts, self._weight = after, weight
+        check_size(len(after))
+        return parent
+
+    def closing(self, T: np.ndarray, starts: Sequence[int]) -> np.ndarray:
+        """Probability of every path, (rows, groups, paths)."""
+        return T[:, list(starts)][:, :, self._state[self.counts]] * self._weight[:, None]
+
+
+class _Class(NamedTuple):
+    """Paths that end with the same counts, one after another: which is the first, and weights (rows, states, paths)."""
+
+    first: int
+    weight: np.ndarray
+
+
+class _PathsOfCounts:
+    """The same where several states may have the same counts: a path's weight is a vector over these."""
+
+    def __init__(self, states: Sequence[np.ndarray], counts: Sequence[int]) -> None:
+        self._states, self.counts = states, np.array(counts)
+        self._classes = {c: _Class(first, np.ones((1, len(states[c]), 1))) for first, c in enumerate(counts)}
+
+    def grow(self, T: np.ndarray) -> np.ndarray:
+        """Let all counts follow that may, and return which path each was before."""
+        grown: dict[int, _Class] = {}
+        parents, paths, numbers = [], 0, 0
+        for c, here in enumerate(self._states):
+            weights = []
+            for before, alive, weight in leading(self._classes, T, here, self._states):
+                parents.append(before.first + alive)
+                weights.append(weight)
+            if weights:
+                grown[c] = _Class(paths, np.concatenate(weights, axis=2))
+                paths, numbers = paths + grown[c].weight.shape[2], numbers + grown[c].weight.size
+                check_size(paths, numbers)
+        self._classes = grown
+        self.counts = np.repeat(list(grown), [paths.weight.shape[2] for paths in grown.values()])
+        return np.concatenate(parents)
+
+    def closing(self, T: np.ndarray, starts: Sequence[int]) -> np.ndarray:
+        """Probability of every path, (rows, groups, paths)."""
+        each = [closing(T, starts, self._states[c], paths.weight) for c, paths in self._classes.items()]
+        return np.concatenate(each, axis=2)
 
 
 def _over(weight: np.ndarray, values: np.ndarray) -> np.ndarray:
     if values.ndim == 4:  # a filter for each row
         return np.einsum("rgp,prij->rgij", weight, values)
-    return np.tensordot(weight, values, axes=1)
-
-
-def _grown(
-    given: LosslessFilter,
-    classes: dict[int, Class],
-    T: np.ndarray,
-    counts: np.ndarray,
-    states: list[np.ndarray],
-    step: int,
-) -> dict[int, Class]:
-    """Every path with every count that may follow."""
-    grown, paths = {}, 0
-    for c, here in enumerate(states):
-        parts = [
-            (before.carried.x[alive], before.carried.root[alive], weight)
-            for before, alive, weight in leading(classes, T, here, states)
-        ]
-        if parts:
-            x, root, weight = zip(*parts, strict=True)
-            together = AlongPath(np.concatenate(x), np.concatenate(root))
-            grown[c] = Class(given.after(together, counts[c], step), np.concatenate(weight, axis=2))
-            paths += len(together.x)
-            check_size(paths, sum(g.weight.size for g in grown.values()))
-    return grown
+    paths = len(values)
+    return (weight.reshape(-1, paths) @ values.reshape(paths, -1)).reshape(*weight.shape[:-1], *values.shape[1:])
 
 
 def check_size(paths: float, numbers: float = 0.0) -> None:
