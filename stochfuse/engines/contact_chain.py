@@ -51,7 +51,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import product
 from math import comb, prod
 from typing import Any, NamedTuple
@@ -135,7 +135,7 @@ def _measured(all_held: Contacts, detects: np.ndarray, network: Network) -> Cont
         [range(r + 1) if missing[kind] else (r,) for kind, r in enumerate(counts)] for counts in all_held.held.tolist()
     ]
     if sum(prod(map(len, each)) for each in ranges) > MOST_STATES:
-        raise too_many_states(network)
+        raise too_many_states(network.agents)
     split = [(state, counts) for state, each in enumerate(ranges) for counts in product(*each)]
     of, counts = np.array([state for state, _ in split]), np.array([counts for _, counts in split])
     held = all_held.held[of]
@@ -197,11 +197,6 @@ class _Classes:
             return there
         return there & np.any(link.reshape(-1, *link.shape[-2:]) > 0, axis=0)[self.pairs]
 
-    @cached_property
-    def sizes(self) -> np.ndarray:
-        """How many agents each class has."""
-        return np.array([len(c) for c in self.members])
-
     def failing(self, step: int, some: slice | np.ndarray, states: np.ndarray) -> np.ndarray:
         """Probability that an agent of a class does not join, (rows, states, classes).
 
@@ -231,25 +226,47 @@ class _Classes:
                 out[:, present, c] *= failed[:, age, None] ** states[present, into, age]
         return out
 
+
+class _Growth(NamedTuple):
+    """All that says which states there are.  A state is the numbers of members of every class and age.
+
+    Parameters
+    ----------
+    sizes : how many agents each class has.
+    possible : whether a receiver of one class may ever hear a sender of another, (classes, classes), as bytes.
+    everyone : whether all hear what one hears.
+    ages : ages 0 … that are told apart.
+    """
+
+    sizes: tuple[int, ...]
+    possible: bytes
+    everyone: bool
+    ages: int
+
+    @property
+    def hears(self) -> np.ndarray:
+        """`possible` as an array."""
+        return np.frombuffer(self.possible, dtype=bool).reshape(len(self.sizes), -1)
+
     def following(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Classes that may join a state, and the states that may follow, (states, classes, ages).
 
         Every number that may join of the first such class with every one of the next, the last one fastest.
         """
         inside = state.sum(axis=1)
-        joining = np.flatnonzero((inside < self.sizes) & self.possible[inside > 0].any(axis=0))
+        joining = np.flatnonzero((inside < self.sizes) & self.hears[inside > 0].any(axis=0))
         left = (self.sizes - inside)[joining]
         number = prod((left + 1).tolist())
         if number > MOST_STATES:
-            raise too_many_states(self.network)
+            raise too_many_states(sum(self.sizes))
         joined = np.indices(left + 1).reshape(len(left), number).T
         after = np.zeros((number, *state.shape), dtype=state.dtype)
         after[:, :, 1:] = state[:, :-1]
         after[:, :, -1] += state[:, -1]
         after[:, joining, 0] += joined.astype(state.dtype)
-        return joining, self._alike(after)
+        return joining, self.alike(after)
 
-    def _alike(self, states: np.ndarray) -> np.ndarray:
+    def alike(self, states: np.ndarray) -> np.ndarray:
         """Give one age to all members whose ages no longer matter: nobody is left whom they may hear, or who is heard
         by some older one too.
         """
@@ -257,23 +274,25 @@ class _Classes:
             return states
         inside = states.sum(axis=2)
         waiting = inside < self.sizes
-        if self.network.architecture == "broadcast":
+        if self.everyone:
             waits = np.broadcast_to(waiting.any(axis=1)[:, None], inside.shape)
             oldest = self.ages - 1 - (states.sum(axis=1)[:, ::-1] > 0).argmax(axis=1)
             same, age = np.ones_like(waits), np.where(waits, oldest[:, None], self.ages - 1)
         else:
-            same, age = ~(waiting @ self.possible.T), np.full(inside.shape, self.ages - 1)
+            same, age = ~(waiting @ self.hears.T), np.full(inside.shape, self.ages - 1)
         one = np.zeros_like(states)
         np.put_along_axis(one, age[:, :, None], inside[:, :, None], axis=2)
         return np.where(same[:, :, None], one, states)
 
 
-def _of_classes(
-    network: Network, rows: LinkRows, kinds: Sequence[int], groups: Sequence[tuple[int, ...]], ages: int
-) -> Contacts:
-    """The states that may be reached.  A state is the numbers of members of every class and age."""
-    classes = _Classes(network, rows, alike(network, rows, kinds), ages)
-    class_of = {agent: c for c, members in enumerate(classes.members) for agent in members}
+@lru_cache(maxsize=2)
+def _reached(
+    growth: _Growth, first: Sequence[int]
+) -> tuple[np.ndarray, list[int], list[tuple[np.ndarray, np.ndarray]]]:
+    """States that may be reached, where a member of each of some classes starts, and what may follow every state.
+
+    Kept, since it is the same for all link probabilities.
+    """
     number: dict[bytes, int] = {}
     found: list[np.ndarray] = []
 
@@ -283,22 +302,32 @@ def _of_classes(
         keys = np.ascontiguousarray(states).reshape(len(states), -1).view(f"V{size}").ravel().tolist()
         out = np.array([number.setdefault(key, len(number)) for key in keys])
         if len(number) > MOST_STATES:
-            raise too_many_states(network)
+            raise too_many_states(sum(growth.sizes))
         for place in np.flatnonzero(out >= len(found)):
             if out[place] == len(found):
                 found.append(states[place])
         return out
 
-    begin = np.zeros((len(groups), len(classes.members), ages), dtype=np.int16)
-    for place, agents in enumerate(groups):
-        begin[place, class_of[agents[0]], 0] = 1
-    starts = tuple(numbers(classes._alike(begin)).tolist())
+    begin = np.zeros((len(first), len(growth.sizes), growth.ages), dtype=np.int16)
+    begin[np.arange(len(first)), first, 0] = 1
+    starts = numbers(growth.alike(begin)).tolist()
     follow: list[tuple[np.ndarray, np.ndarray]] = []
     while len(follow) < len(found):
-        joining, after = classes.following(found[len(follow)])
+        joining, after = growth.following(found[len(follow)])
         follow.append((joining, numbers(after)))
-    states = np.array(found)
-    left = (classes.sizes - states.sum(axis=2)).tolist()
+    return np.array(found), starts, follow
+
+
+def _of_classes(
+    network: Network, rows: LinkRows, kinds: Sequence[int], groups: Sequence[tuple[int, ...]], ages: int
+) -> Contacts:
+    """The chain, its states split by classes and ages."""
+    classes = _Classes(network, rows, alike(network, rows, kinds), ages)
+    class_of = {agent: c for c, members in enumerate(classes.members) for agent in members}
+    sizes = tuple(map(len, classes.members))
+    growth = _Growth(sizes, classes.possible.tobytes(), network.architecture == "broadcast", ages)
+    states, starts, follow = _reached(growth, tuple(class_of[agents[0]] for agents in groups))
+    left = (sizes - states.sum(axis=2)).tolist()
 
     def transition(step: int, some: slice | np.ndarray) -> np.ndarray:
         failed = classes.failing(step, some, states)
@@ -314,7 +343,7 @@ def _of_classes(
     kind_of = np.array([kinds[members[0]] for members in classes.members])
     inside = states.sum(axis=2)
     held = np.stack([inside[:, kind_of == kind].sum(axis=1) for kind in sorted(set(kinds))], axis=1).astype(int)
-    return Contacts(held, starts, transition, not rows.varies)
+    return Contacts(held, tuple(starts), transition, not rows.varies)
 
 
 def _binomial(n: int, failed: np.ndarray) -> np.ndarray:
@@ -330,10 +359,10 @@ def _binomial(n: int, failed: np.ndarray) -> np.ndarray:
     return np.exp(ways + logs[0] + logs[1])
 
 
-def too_many_states(network: Network) -> TooManyStatesError:
+def too_many_states(agents: int) -> TooManyStatesError:
     """Return the error of a chain that is too large."""
     return TooManyStatesError(
-        f"method 'optimal': the contact chain of {network.agents} agents has more than {MOST_STATES} states with these "
+        f"method 'optimal': the contact chain of {agents} agents has more than {MOST_STATES} states with these "
         "links: expected fewer agents or steps, or links and sensors that tell fewer of them apart; or use --method "
         "monte-carlo with --estimator optimal"
     )
