@@ -51,7 +51,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import product
 from math import comb, prod
 from typing import Any, NamedTuple
@@ -61,6 +61,7 @@ import numpy as np
 from stochfuse.engines.events import alike
 from stochfuse.engines.progress import listener
 from stochfuse.errors import UsageError
+from stochfuse.kalman.algebra import NUMPY
 from stochfuse.kalman.kernel import (
     AsTheyAre,
     Estimate,
@@ -70,7 +71,6 @@ from stochfuse.kalman.kernel import (
     posterior_gain,
     predict,
     predict_factor,
-    update,
     update_factor,
 )
 from stochfuse.scenario.model import Model, Sensor
@@ -135,7 +135,7 @@ def _measured(all_held: Contacts, detects: np.ndarray, network: Network) -> Cont
         [range(r + 1) if missing[kind] else (r,) for kind, r in enumerate(counts)] for counts in all_held.held.tolist()
     ]
     if sum(prod(map(len, each)) for each in ranges) > MOST_STATES:
-        raise too_many_states(network)
+        raise too_many_states(network.agents)
     split = [(state, counts) for state, each in enumerate(ranges) for counts in product(*each)]
     of, counts = np.array([state for state, _ in split]), np.array([counts for _, counts in split])
     held = all_held.held[of]
@@ -197,11 +197,6 @@ class _Classes:
             return there
         return there & np.any(link.reshape(-1, *link.shape[-2:]) > 0, axis=0)[self.pairs]
 
-    @property
-    def sizes(self) -> np.ndarray:
-        """How many agents each class has."""
-        return np.array([len(c) for c in self.members])
-
     def failing(self, step: int, some: slice | np.ndarray, states: np.ndarray) -> np.ndarray:
         """Probability that an agent of a class does not join, (rows, states, classes).
 
@@ -231,47 +226,73 @@ class _Classes:
                 out[:, present, c] *= failed[:, age, None] ** states[present, into, age]
         return out
 
+
+class _Growth(NamedTuple):
+    """All that says which states there are.  A state is the numbers of members of every class and age.
+
+    Parameters
+    ----------
+    sizes : how many agents each class has.
+    possible : whether a receiver of one class may ever hear a sender of another, (classes, classes), as bytes.
+    everyone : whether all hear what one hears.
+    ages : ages 0 … that are told apart.
+    """
+
+    sizes: tuple[int, ...]
+    possible: bytes
+    everyone: bool
+    ages: int
+
+    @property
+    def hears(self) -> np.ndarray:
+        """`possible` as an array."""
+        return np.frombuffer(self.possible, dtype=bool).reshape(len(self.sizes), -1)
+
     def following(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Classes that may join a state, and the states that may follow, (states, classes, ages).
 
         Every number that may join of the first such class with every one of the next, the last one fastest.
         """
         inside = state.sum(axis=1)
-        joining = np.flatnonzero((inside < self.sizes) & self.possible[inside > 0].any(axis=0))
+        joining = np.flatnonzero((inside < self.sizes) & self.hears[inside > 0].any(axis=0))
         left = (self.sizes - inside)[joining]
         number = prod((left + 1).tolist())
         if number > MOST_STATES:
-            raise too_many_states(self.network)
+            raise too_many_states(sum(self.sizes))
         joined = np.indices(left + 1).reshape(len(left), number).T
         after = np.zeros((number, *state.shape), dtype=state.dtype)
         after[:, :, 1:] = state[:, :-1]
         after[:, :, -1] += state[:, -1]
         after[:, joining, 0] += joined.astype(state.dtype)
-        return joining, self._alike(after) if self.ages > 1 else after
+        return joining, self.alike(after)
 
-    def _alike(self, states: np.ndarray) -> np.ndarray:
+    def alike(self, states: np.ndarray) -> np.ndarray:
         """Give one age to all members whose ages no longer matter: nobody is left whom they may hear, or who is heard
         by some older one too.
         """
+        if self.ages == 1:
+            return states
         inside = states.sum(axis=2)
         waiting = inside < self.sizes
-        if self.network.architecture == "broadcast":
+        if self.everyone:
             waits = np.broadcast_to(waiting.any(axis=1)[:, None], inside.shape)
             oldest = self.ages - 1 - (states.sum(axis=1)[:, ::-1] > 0).argmax(axis=1)
             same, age = np.ones_like(waits), np.where(waits, oldest[:, None], self.ages - 1)
         else:
-            same, age = ~(waiting @ self.possible.T), np.full(inside.shape, self.ages - 1)
+            same, age = ~(waiting @ self.hears.T), np.full(inside.shape, self.ages - 1)
         one = np.zeros_like(states)
         np.put_along_axis(one, age[:, :, None], inside[:, :, None], axis=2)
         return np.where(same[:, :, None], one, states)
 
 
-def _of_classes(
-    network: Network, rows: LinkRows, kinds: Sequence[int], groups: Sequence[tuple[int, ...]], ages: int
-) -> Contacts:
-    """The states that may be reached.  A state is the numbers of members of every class and age."""
-    classes = _Classes(network, rows, alike(network, rows, kinds), ages)
-    class_of = {agent: c for c, members in enumerate(classes.members) for agent in members}
+@lru_cache(maxsize=2)
+def _reached(
+    growth: _Growth, first: Sequence[int]
+) -> tuple[np.ndarray, list[int], list[tuple[np.ndarray, np.ndarray]]]:
+    """States that may be reached, where a member of each of some classes starts, and what may follow every state.
+
+    Kept, since it is the same for all link probabilities.
+    """
     number: dict[bytes, int] = {}
     found: list[np.ndarray] = []
 
@@ -281,22 +302,32 @@ def _of_classes(
         keys = np.ascontiguousarray(states).reshape(len(states), -1).view(f"V{size}").ravel().tolist()
         out = np.array([number.setdefault(key, len(number)) for key in keys])
         if len(number) > MOST_STATES:
-            raise too_many_states(network)
+            raise too_many_states(sum(growth.sizes))
         for place in np.flatnonzero(out >= len(found)):
             if out[place] == len(found):
                 found.append(states[place])
         return out
 
-    begin = np.zeros((len(groups), len(classes.members), ages), dtype=np.int16)
-    for place, agents in enumerate(groups):
-        begin[place, class_of[agents[0]], 0] = 1
-    starts = tuple(numbers(classes._alike(begin)).tolist())
+    begin = np.zeros((len(first), len(growth.sizes), growth.ages), dtype=np.int16)
+    begin[np.arange(len(first)), first, 0] = 1
+    starts = numbers(growth.alike(begin)).tolist()
     follow: list[tuple[np.ndarray, np.ndarray]] = []
     while len(follow) < len(found):
-        joining, after = classes.following(found[len(follow)])
+        joining, after = growth.following(found[len(follow)])
         follow.append((joining, numbers(after)))
-    states = np.array(found)
-    left = (classes.sizes - states.sum(axis=2)).tolist()
+    return np.array(found), starts, follow
+
+
+def _of_classes(
+    network: Network, rows: LinkRows, kinds: Sequence[int], groups: Sequence[tuple[int, ...]], ages: int
+) -> Contacts:
+    """The chain, its states split by classes and ages."""
+    classes = _Classes(network, rows, alike(network, rows, kinds), ages)
+    class_of = {agent: c for c, members in enumerate(classes.members) for agent in members}
+    sizes = tuple(map(len, classes.members))
+    growth = _Growth(sizes, classes.possible.tobytes(), network.architecture == "broadcast", ages)
+    states, starts, follow = _reached(growth, tuple(class_of[agents[0]] for agents in groups))
+    left = (sizes - states.sum(axis=2)).tolist()
 
     def transition(step: int, some: slice | np.ndarray) -> np.ndarray:
         failed = classes.failing(step, some, states)
@@ -312,7 +343,7 @@ def _of_classes(
     kind_of = np.array([kinds[members[0]] for members in classes.members])
     inside = states.sum(axis=2)
     held = np.stack([inside[:, kind_of == kind].sum(axis=1) for kind in sorted(set(kinds))], axis=1).astype(int)
-    return Contacts(held, starts, transition, not rows.varies)
+    return Contacts(held, tuple(starts), transition, not rows.varies)
 
 
 def _binomial(n: int, failed: np.ndarray) -> np.ndarray:
@@ -328,10 +359,10 @@ def _binomial(n: int, failed: np.ndarray) -> np.ndarray:
     return np.exp(ways + logs[0] + logs[1])
 
 
-def too_many_states(network: Network) -> TooManyStatesError:
+def too_many_states(agents: int) -> TooManyStatesError:
     """Return the error of a chain that is too large."""
     return TooManyStatesError(
-        f"method 'optimal': the contact chain of {network.agents} agents has more than {MOST_STATES} states with these "
+        f"method 'optimal': the contact chain of {agents} agents has more than {MOST_STATES} states with these "
         "links: expected fewer agents or steps, or links and sensors that tell fewer of them apart; or use --method "
         "monte-carlo with --estimator optimal"
     )
@@ -407,28 +438,25 @@ class LosslessFilter(NamedTuple):
 
     def start(self, counts: np.ndarray) -> AlongPath:
         """Estimate from so many agents' initial ones, and what it leaves of the error."""
-        x = np.zeros((self.model.dimension, 1)) if self.error is None else self.error
         first = self.P0 if self.shared or self.first is not None else self.P0 / counts.sum()
         P = (first if self.first is None else self.first[tuple(counts.tolist())])[None]
-        return AlongPath(np.broadcast_to(x, (*P.shape[:-1], 1)), P if self.scalar else self.numbers.factor(P))
+        x = None if self.error is None else np.broadcast_to(self.error, (*P.shape[:-1], 1))
+        return AlongPath(x, P if self.scalar else self.numbers.factor(P))
 
     def after(self, before: AlongPath, counts: np.ndarray, step: int) -> AlongPath:
         """Predict to a step and take in the measurements of so many agents of each kind; of errors, if there are.
 
-        Of one kind, the numbers may be a stack (..., 1) that goes with the estimate's.
+        The numbers may be a stack (..., kinds) that goes with the estimate's.
         """
         F, Q = at_step(self.model.F, step), at_step(self.model.Q, step)
         given = self.numbers
         sensors = [(given.rounded(at_step(s.H, step)), given.noise(at_step(s.R, step))) for s in self.sensors]
-        arrived = [(H, R, n) for (H, R), n in zip(sensors, np.moveaxis(counts, -1, 0), strict=True) if n.any()]
+        arrived = [(H, R, n) for kind, (H, R) in enumerate(sensors) if (n := counts[..., kind]).any()]
         if self.scalar:
-            estimate = predict(Estimate(*before), F, Q)
-            for H, R, n in arrived:
-                J = H.T @ np.linalg.solve(R, H)  # all that a measurement of a scalar says, whatever its size
-                if J.any():
-                    R = 1.0 / (J * _at_least(n)[..., None, None])
-                    estimate = update(estimate, np.ones((1, 1)), R, np.zeros((1, 1)))
-            return AlongPath(*estimate)
+            x, P = predict(Estimate(*before), F, Q)
+            # all that measurements of a scalar say, whatever their size
+            gained = 1.0 + P * sum(n[..., None, None] * (H.T @ NUMPY.solve(R, H)) for H, R, n in arrived)
+            return AlongPath(None if x is None else x / gained, P / gained)
         x, L = before.x, given.rounded(predict_factor(given.rounded(before.root), F, given.factor(Q)))
         x = x if x is None else F @ x
         for H, R, n in arrived:
@@ -480,17 +508,12 @@ class TooManyPathsError(UsageError):
     """More paths than can be gone through one by one."""
 
 
-class Class(NamedTuple):
-    """Paths that end with the same counts: what each carries, and weight (rows, states of those counts, paths)."""
-
-    carried: AlongPath
-    weight: np.ndarray
-
-
 def by_counts(contacts: Contacts) -> tuple[np.ndarray, list[np.ndarray]]:
     """Different counts (classes, kinds), and the states of each."""
-    counts, class_of = np.unique(contacts.held, axis=0, return_inverse=True)
-    return counts, [np.flatnonzero(class_of.ravel() == c) for c in range(len(counts))]
+    states: dict[tuple[int, ...], list[int]] = {}
+    for state, held in enumerate(contacts.held.tolist()):
+        states.setdefault(tuple(held), []).append(state)
+    return np.array(sorted(states)), [np.array(states[held]) for held in sorted(states)]
 
 
 def blocks_of_rows(contacts: Contacts, rows: int) -> Iterator[slice]:
@@ -546,14 +569,16 @@ def expected_optimum(given: LosslessFilter, contacts: Contacts, steps: int, rows
 
 def joined(found: Sequence[tuple[list[np.ndarray], int]]) -> Chain:
     """Return what `over_paths` found for all blocks of rows."""
-    P, b, M = (np.concatenate([moments[m] for moments, _ in found]) for m in range(3))
+    P, *errors = (np.concatenate(moment) for moment in zip(*(moments for moments, _ in found), strict=True))
+    b, M = errors or (np.zeros((*P.shape[:-1], 1)), P)
     return Chain(P, b, M, np.zeros(P.shape[:2]), found[0][1])
 
 
 def over_paths(
     given: LosslessFilter, contacts: Contacts, steps: int, some: slice | np.ndarray
 ) -> tuple[list[np.ndarray], int]:
-    """E[P], E[b] and E[P + b bᵀ] of some rows, each (rows, steps, groups, …), and the number of paths.
+    """E[P] and, where errors are followed, E[b] and E[P + b bᵀ] of some rows, each (rows, steps, groups, …); and the
+    number of paths.
 
     Parameters
     ----------
@@ -565,62 +590,98 @@ def over_paths(
         If there are more than `MOST_PATHS`.
     """
     counts, states = by_counts(contacts)
-    classes: dict[int, Class] = {}
-    out: list[list[np.ndarray]] = [[], [], []]
-    paths, before = 0, np.empty(0)
+    first = given.begins(counts)
+    single = len(states) == len(contacts.held)
+    paths = _PathsOfStates(states, first) if single else _PathsOfCounts(states, first)
+    x, roots = zip(*(given.start(counts[c]) for c in first), strict=True)
+    carried = AlongPath(None if x[0] is None else np.concatenate(x), np.concatenate(roots))
+    out, before = [], np.empty(0)
     for step, T in enumerate(transitions(contacts, steps, some), start=1):
-        if step == 1:
-            ones = {c: np.ones((len(T), len(states[c]), 1)) for c in given.begins(counts)}
-            classes = {c: Class(given.start(counts[c]), weight) for c, weight in ones.items()}
-        else:
-            classes = _grown(given, classes, before, counts, states, step)
-        paths = sum(c.weight.shape[2] for c in classes.values())
-        for place, moment in enumerate(_closed(given, classes, T, states, contacts.starts)):
-            out[place].append(moment)
+        if step > 1:
+            parent = paths.grow(before)
+            n = counts[paths.counts]
+            n = n if carried.root.ndim == 3 else n[:, None]  # a filter for each row
+            x = None if carried.x is None else carried.x[parent]
+            carried = given.after(AlongPath(x, carried.root[parent]), n, step)
+        weight, P, x = paths.closing(T, contacts.starts), given.covariance(carried), carried.x
+        moments = (P,) if x is None else (P, x, P + x @ np.swapaxes(x, -1, -2))
+        out.append([_over(weight, moment) for moment in moments])
         before = T
-    return [np.stack(moment, axis=1) for moment in out], paths
+    return [np.stack(moment, axis=1) for moment in zip(*out, strict=True)], len(carried.root)
 
 
-def _closed(
-    given: LosslessFilter, classes: dict[int, Class], T: np.ndarray, states: list[np.ndarray], starts: Sequence[int]
-) -> tuple[Any, Any, Any]:
-    """E[P], E[b] and E[P + b bᵀ] over the paths, each (rows, groups, …)."""
-    P, b, M = 0.0, 0.0, 0.0
-    for c, (carried, weight) in classes.items():
-        last = closing(T, starts, states[c], weight)
-        x, now = carried.x, given.covariance(carried)
-        P, b, M = P + _over(last, now), b + _over(last, x), M + _over(last, now + x @ np.swapaxes(x, -1, -2))
-    return P, b, M
+class _PathsOfStates:
+    """Paths and their weights (rows, paths), where every state has counts of its own.
+
+    Parameters
+    ----------
+    states : states of the different counts.
+    counts : place of those that every path begins with, and ends with later.
+    """
+
+    def __init__(self, states: Sequence[np.ndarray], counts: Sequence[int]) -> None:
+        self.counts, self._state, self._weight = np.array(counts), np.concatenate(states), np.ones((1, len(counts)))
+
+    def grow(self, T: np.ndarray) -> np.ndarray:
+        """Let all counts follow that may, and return which path each was before."""
+        now = self._state[self.counts]
+        after, parent = np.asarray(T.any(axis=0))[self._state][:, now].nonzero()
+        check_size(0, len(T) * len(after))
+        weight = self._weight[:, parent] * T[:, self._state[after], now[parent]]
+        alive = weight.any(axis=0)
+        if not alive.all():
+            after, parent, weight = after[alive], parent[alive], weight[:, alive]
+        self.counts, self._weight = after, weight
+        check_size(len(after))
+        return parent
+
+    def closing(self, T: np.ndarray, starts: Sequence[int]) -> np.ndarray:
+        """Probability of every path, (rows, groups, paths)."""
+        return T[:, list(starts)][:, :, self._state[self.counts]] * self._weight[:, None]
+
+
+class _Class(NamedTuple):
+    """Paths that end with the same counts, one after another: which is the first, and weights (rows, states, paths)."""
+
+    first: int
+    weight: np.ndarray
+
+
+class _PathsOfCounts:
+    """The same where several states may have the same counts: a path's weight is a vector over these."""
+
+    def __init__(self, states: Sequence[np.ndarray], counts: Sequence[int]) -> None:
+        self._states, self.counts = states, np.array(counts)
+        self._classes = {c: _Class(first, np.ones((1, len(states[c]), 1))) for first, c in enumerate(counts)}
+
+    def grow(self, T: np.ndarray) -> np.ndarray:
+        """Let all counts follow that may, and return which path each was before."""
+        grown: dict[int, _Class] = {}
+        parents, paths, numbers = [], 0, 0
+        for c, here in enumerate(self._states):
+            weights = []
+            for before, alive, weight in leading(self._classes, T, here, self._states):
+                parents.append(before.first + alive)
+                weights.append(weight)
+            if weights:
+                grown[c] = _Class(paths, np.concatenate(weights, axis=2))
+                paths, numbers = paths + grown[c].weight.shape[2], numbers + grown[c].weight.size
+                check_size(paths, numbers)
+        self._classes = grown
+        self.counts = np.repeat(list(grown), [paths.weight.shape[2] for paths in grown.values()])
+        return np.concatenate(parents)
+
+    def closing(self, T: np.ndarray, starts: Sequence[int]) -> np.ndarray:
+        """Probability of every path, (rows, groups, paths)."""
+        each = [closing(T, starts, self._states[c], paths.weight) for c, paths in self._classes.items()]
+        return np.concatenate(each, axis=2)
 
 
 def _over(weight: np.ndarray, values: np.ndarray) -> np.ndarray:
     if values.ndim == 4:  # a filter for each row
         return np.einsum("rgp,prij->rgij", weight, values)
-    return np.tensordot(weight, values, axes=1)
-
-
-def _grown(
-    given: LosslessFilter,
-    classes: dict[int, Class],
-    T: np.ndarray,
-    counts: np.ndarray,
-    states: list[np.ndarray],
-    step: int,
-) -> dict[int, Class]:
-    """Every path with every count that may follow."""
-    grown, paths = {}, 0
-    for c, here in enumerate(states):
-        parts = [
-            (before.carried.x[alive], before.carried.root[alive], weight)
-            for before, alive, weight in leading(classes, T, here, states)
-        ]
-        if parts:
-            x, root, weight = zip(*parts, strict=True)
-            together = AlongPath(np.concatenate(x), np.concatenate(root))
-            grown[c] = Class(given.after(together, counts[c], step), np.concatenate(weight, axis=2))
-            paths += len(together.x)
-            check_size(paths, sum(g.weight.size for g in grown.values()))
-    return grown
+    paths = len(values)
+    return (weight.reshape(-1, paths) @ values.reshape(paths, -1)).reshape(*weight.shape[:-1], *values.shape[1:])
 
 
 def check_size(paths: float, numbers: float = 0.0) -> None:

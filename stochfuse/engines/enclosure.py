@@ -96,13 +96,8 @@ def _on_a_grid(given: LosslessFilter, contacts: Contacts, steps: int, some: slic
 
     def after(P: np.ndarray, step: int) -> np.ndarray:
         """P(t) in every state from P(t−1), (..., states, any)."""
-        out = np.empty(np.broadcast_shapes(P.shape, (len(contacts.held), 1)))
-        P = np.broadcast_to(P, out.shape)[..., None, None]
-        if counts.shape[1] == 1:
-            return given.after(AlongPath(None, P), contacts.held[:, None], step).root[..., 0, 0]
-        for count, here in zip(counts, states, strict=True):
-            out[..., here, :] = given.after(AlongPath(None, P[..., here, :, :, :]), count, step).root[..., 0, 0]
-        return out
+        P = np.broadcast_to(P, np.broadcast_shapes(P.shape, (len(contacts.held), 1)))[..., None, None]
+        return given.after(AlongPath(None, P), contacts.held[:, None], step).root[..., 0, 0]
 
     # what a state without a first estimate would start from does not matter
     start = np.full(len(contacts.held), given.covariance(given.start(counts[-1])).item())

@@ -31,6 +31,7 @@ from stochfuse.kalman.kernel import (
     from_factor,
     join_factors,
     predict_factor,
+    taken_in,
     update_factor,
     update_information,
 )
@@ -331,25 +332,26 @@ class UnlikeCase:
         nothing = Information(None, np.zeros_like(prior))
         gained = np.stack([update_information(nothing, s.H @ prior, s.R).Y for s in sensors])
         weights = self.weights[step - 1]
-        if (self.counts @ np.trace(gained, axis1=-2, axis2=-1)).max() > PRECISE:
+        if (self.counts[-1] @ np.trace(gained, axis1=-2, axis2=-1)).max() > PRECISE:  # everybody is heard
             return Carried(self._precise(prior, sensors, weights), carried.left)
-        left, nothing_gained = np.zeros_like(prior), np.eye(self.model.dimension)
-        block = max(1, ELEMENTS // prior.size)
+        left, before = np.zeros_like(prior), np.eye(self.model.dimension)[..., None, None]
+        gained, block = gained.transpose(2, 3, 1, 0), max(1, ELEMENTS // prior.size)
         for first in range(0, len(self.counts), block):
             some = np.s_[first : first + block]
-            total = np.tensordot(self.counts[some].astype(float), gained, axes=1)
-            left += np.einsum("ci,cijk->ijk", weights[some], np.linalg.inv(nothing_gained + total))
+            after = taken_in(before, gained @ self.counts[some].T.astype(float))[0]
+            left += np.einsum("jkic,ci->ijk", after, weights[some])
         return Carried(prior @ factor(left), carried.left)
 
     def _precise(self, prior: np.ndarray, sensors: list[Sensor], weights: np.ndarray) -> np.ndarray:
         whitened = [np.linalg.solve(np.linalg.cholesky(s.R), s.H) for s in sensors]
-        joined, waiting = [], []
-        for count, weight in zip(self.counts, weights, strict=True):
-            H = np.concatenate([np.sqrt(c) * W for c, W in zip(count, whitened, strict=True)])
-            waiting.append(update_factor(prior, H, np.eye(len(H))) * np.sqrt(weight)[:, None, None])
-            if len(waiting) == 64:
-                joined, waiting = [join_factors(*joined, *waiting)], []
-        return join_factors(*joined, *waiting)
+        joined, block = [], 64
+        for first in range(0, len(self.counts), block):
+            some = np.s_[first : first + block]
+            n = np.sqrt(self.counts[some], dtype=float)[:, None, :, None, None]
+            H = np.concatenate([n[:, :, kind] * W for kind, W in enumerate(whitened)], axis=-2)
+            roots = update_factor(prior, H, np.eye(H.shape[-2])) * np.sqrt(weights[some])[..., None, None]
+            joined = [join_factors(*joined, *roots)]
+        return joined[0]
 
     def covariance(self, carried: Carried, out: np.ndarray | None = None) -> np.ndarray:
         return _from_factors(carried.value, out)

@@ -121,12 +121,17 @@ class Loop:
         for M, entries in zip(arrays, self._read, strict=True):
             words += [M.strides[0] if M.ndim == 3 else 0, *_addresses(M, entries, M.strides[-2:])]
         table = np.array(words, dtype=np.int64)
-        self._run(table.ctypes.data)
+        self._run(address(table))
 
 
 def _addresses(M: np.ndarray, entries: Entries, strides: Sequence[int]) -> list[int]:
-    address, down, right = M.ctypes.data, *strides
-    return [address + i * down + j * right for i, j in entries]
+    begin, (down, right) = address(M), strides
+    return [begin + i * down + j * right for i, j in entries]
+
+
+def address(M: np.ndarray) -> int:
+    """Return where an array's first number is kept, in a tenth of the time that its `ctypes` takes."""
+    return M.__array_interface__["data"][0]
 
 
 def padded(items: int) -> int:

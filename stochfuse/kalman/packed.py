@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stochfuse.errors import UsageError
-from stochfuse.kalman.compiled import LANES, Loop, padded, pays
+from stochfuse.kalman.compiled import LANES, Loop, address, padded, pays
 from stochfuse.kalman.kernel import Estimate, factor, from_factor, predict, predict_factor, update_factor
 
 CANCELLATION = 1e-5
@@ -67,7 +67,7 @@ def upper(P: np.ndarray) -> np.ndarray:
     """Upper triangles (d(d+1)/2, items) of P (items, d, d)."""
     d = P.shape[-1]
     rows, columns, _ = triangle(d)
-    return P.reshape(-1, d * d).T[rows * d + columns]
+    return P.reshape(-1, d * d).T[rows * d + columns] if d > 1 else P.reshape(1, -1)
 
 
 def prior_map(F: np.ndarray, Q: np.ndarray, A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -146,8 +146,8 @@ def covariances(P: np.ndarray, F: np.ndarray, Q: np.ndarray, H: np.ndarray, R: n
     out = np.empty((1, d, d, len(P)))
     with np.errstate(all="ignore"):
         left = carry(P, [step] * steps, out)
-        suspects = np.flatnonzero(~(left > CANCELLATION))
-        if len(suspects):
+        if not left.min(initial=1.0) > CANCELLATION:
+            suspects = np.flatnonzero(~(left > CANCELLATION))
             some = Step(*(M if M.ndim == 2 else M[suspects] for M in step))
             L, noise = factor(P[suspects]), factor(some.Q)
             for _ in range(steps):
@@ -182,21 +182,21 @@ def carry(
     """
     d, p, items = out.shape[1], through[0].H.shape[-2], out.shape[-1]
     pay = d > 1 and items > 0 and pays(items * len(through), d * d * (3 * d + 1) // 2 + 2 * p * d * (d + p))
-    own = any(M.ndim == 3 for step in through for M in (step.F, step.H))
+    own = any(step.F.ndim == 3 or step.H.ndim == 3 for step in {id(step): step for step in through}.values())
     loop = compiled_step(d, p, own) if pay else None
     if loop is not None:
         return _carry_compiled(loop, P, through, out, share, unsound, after)
     heights = _heights(d, p, own)
     blocks = -(-items // max(FEWEST, CACHE // sum(heights)))
     size = max(1, -(-items // (8 * max(blocks, 1))) * 8)
-    left, memory = np.ones(items), _aligned(sum(heights) * min(size, items))
+    left, memory = np.empty(items), _aligned(sum(heights) * min(size, items))
     for first in range(0, items, size):
         block = np.s_[first : min(first + size, items)]
         width = block.stop - first
-        arrays, end = [], 0
+        whole, arrays, end = memory[: sum(heights) * width].reshape(-1, width), [], 0
         for height in heights:
-            arrays.append(memory[end : end + height * width].reshape(height, width))
-            end += height * width
+            arrays.append(whole[end : end + height])
+            end += height
         rows = arrays[0]
         rows[:] = upper(P[block] if P.ndim == 3 else P)
         if isinstance(share, np.ndarray):
@@ -235,7 +235,7 @@ def _carry_compiled(
     for first in range(0, items, size):
         block = np.s_[first : min(first + size, items)]
         width, now, made = block.stop - first, P[block], out[..., block]
-        watched[:] = 0.0
+        watched[:] = _TINY
         watch = _Watch(d, p, watched[:p, :width], watched[p:, :width])
         for k, end in pairwise([0, *cuts, len(through)]):
             step = through[k].take(block)
@@ -278,18 +278,21 @@ def compiled_step(d: int, p: int, own: bool) -> Loop | None:
         return None
 
 
+@lru_cache(maxsize=64)
 def _heights(d: int, p: int, own: bool) -> list[int]:
     """Rows of the arrays that a block works with: P, the prior's, constants, products, and two of passing use."""
     n = d * (d + 1) // 2
     whole = n + p * d + p * p
     full = 2 * d * d if own or d > ONE_PRODUCT else 0
+    if d == 1:
+        return [1, 1]
     return [n, whole, whole, n, max(full, (p - 1) * max(d, p), 1), p * d + 2 * p + d]
 
 
 def _aligned(size: int) -> np.ndarray:
     """Memory whose rows begin where a cache line does."""
     memory = np.empty(size + 8)
-    first = -memory.ctypes.data // 8 % 8
+    first = -address(memory) // 8 % 8
     return memory[first : first + size]
 
 
@@ -299,8 +302,8 @@ class _Watch:
     Parameters
     ----------
     d, p : numbers of states and of measurements.
-    most : (p, width) for the largest S_ii while the noise stays the same, zero.
-    peak : (d, width) for the largest prior variances, zero.
+    most : (p, width) for the largest S_ii while the noise stays the same, `_TINY`.
+    peak : (d, width) for the largest prior variances, `_TINY`.
     """
 
     def __init__(self, d: int, p: int, most: np.ndarray, peak: np.ndarray) -> None:
@@ -317,7 +320,7 @@ class _Watch:
 
         Digits are lost by degrees, too: to a variance far below its peak, or in a P that is nearly singular.
         """
-        kept = (P[triangle(self.d)[2].diagonal()] + _TINY) / (self.peak + _TINY)
+        kept = (P[triangle(self.d)[2].diagonal()] + _TINY) / self.peak
         self.left = np.minimum(self.left, np.minimum.reduce(kept))
         if steps >= EVERY:
             self.left = np.minimum(self.left, smallest_pivot(P, self.d))
@@ -329,10 +332,13 @@ class _Watch:
         """
         if not len(self.R):
             return
-        gained = np.add.reduce(self.most / self.R[triangle(self.p)[2].diagonal()]) - self.p
-        left = 1.0 if self.p == 1 else smallest_pivot(self.R, self.p)
-        self.left, self.R = np.minimum(self.left, left / (1.0 + gained)), self.R[:0]
-        self.most[:] = 0.0
+        if self.p == 1:
+            left = self.R[0] / self.most[0]
+        else:
+            gained = np.add.reduce(self.most / self.R[triangle(self.p)[2].diagonal()]) - self.p
+            left = smallest_pivot(self.R, self.p) / (1.0 + gained)
+        self.left, self.R = np.minimum(self.left, left), self.R[:0]
+        self.most[:] = _TINY
 
 
 class _FilterBlock:
@@ -347,7 +353,7 @@ class _FilterBlock:
         self.W, self.U = X[n : n + p * d].reshape(p, d, width), U[: p * d].reshape(p, d, width)
         self.turn, self.shown = U[p * d : p * d + p], X[n + p * d :: p + 1]
         self.diagonal = triangle(d)[2].diagonal()
-        U[p * d + p :] = 0.0
+        U[p * d + p :] = _TINY
         self.watch = _Watch(d, p, U[p * d + p : p * d + 2 * p], U[p * d + 2 * p :])
 
     @property
@@ -370,7 +376,7 @@ class _FilterBlock:
         if self.one and Q.ndim == 2:
             self.C[:, 1:] = self.C[:, :1]
         self.watch.begin(R)
-        self.C[n + p * d :] += self.watch.R[triangle(p)[2].ravel()]
+        self.C[n + p * d :] += self.watch.R if p == 1 else self.watch.R[triangle(p)[2].ravel()]
 
     def advance(self, k: int, last: bool) -> None:
         """Predict and update, the k-th time, counted from 0."""

@@ -59,6 +59,7 @@ def averaged(system: System, items: Items, how: Settings, errors: bool) -> Avera
         If the chain's states or paths are too many.
     """
     links, network = items.links, system.network
+    system = system if errors else replace(system, error=None)
     groups = groups_of(system, links)
     try:
         chain = contacts(network, links, system.sensor_of, groups, system.detects)

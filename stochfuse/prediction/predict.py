@@ -467,17 +467,15 @@ def _asked(scenario: Scenario, method: str | None, quantity: str, settings: Mapp
         near = nearest(wrong, known)
         raise TypeError(f"predict() got an unexpected keyword argument '{wrong}'{near}; expected {', '.join(known)}")
     how = Settings(**{"estimator": scenario.estimator or LFG, "runs": scenario.runs or RUNS, **settings})
-    how = replace(how, estimator=estimator_named(how.estimator))
+    estimator = estimator_named(how.estimator)
     choose("criterion", how.criterion, CRITERIA)
     choose("control", how.control, CONTROLS)
     _check_precision(method, how, settings)
-    shown = how.shown
-    if not shown.metrics:
-        shown = replace(shown, metrics=(metric_of(scenario.metric or "trace", scenario.model),))
-    how = replace(how, shown=shown if shown.quantities else replace(shown, quantities=(quantity,)))
+    metrics = how.shown.metrics or (metric_of(scenario.metric or "trace", scenario.model),)
+    shown = replace(how.shown, metrics=metrics, quantities=how.shown.quantities or (quantity,))
     if quantity == OPTIMAL:
-        method, how = (MONTE_CARLO if method == MONTE_CARLO else OPTIMAL), replace(how, estimator=OPTIMAL)
-    return method, replace(how, estimator=NAIVE) if method == NAIVE else how
+        method, estimator = (MONTE_CARLO if method == MONTE_CARLO else OPTIMAL), OPTIMAL
+    return method, replace(how, estimator=NAIVE if method == NAIVE else estimator, shown=shown)
 
 
 def _check_precision(method: str, how: Settings, given: Mapping[str, Any]) -> None:

@@ -31,7 +31,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
+from math import prod
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -53,8 +53,8 @@ from stochfuse.scenario.system import Items, Noises, System
 
 DOUBTFUL = 1e-10
 """Smallest pivot of R, relative to its variance, below which it takes a library's word that there is a factor."""
-MOST_OUTCOMES = 100_000
-"""Sets of senders (counted by kind of sensor) beyond which unlike agents are refused."""
+MOST_WEIGHTS = 1 << 28
+"""Probabilities of sets of senders (counted by kind of sensor) beyond which unlike agents are refused: 2 GB of them."""
 
 
 def outcome(prior: Estimate, H: Any, R: Any, m: int, z: Any = None, *, algebra: Algebra = NUMPY) -> Estimate:
@@ -369,7 +369,8 @@ def _group(
         arrivals = [tables[id(h)] for h in by_step]
         items = by_step[0].shape[0] * len(first)
         return LikeAgents(members, Case(system.model, system.sensors[0], system.P0, shared, arrivals, items))
-    return LikeAgents(members, _outcomes(system, shared, own, kinds_here[first], [h[:, first] for h in by_step]))
+    once = {id(h): h[:, first] for h in by_step}
+    return LikeAgents(members, _outcomes(system, shared, own, kinds_here[first], [once[id(h)] for h in by_step]))
 
 
 def _sort_within(heard: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -389,20 +390,21 @@ def _outcomes(system: System, shared: bool, own: int, sender_kinds: np.ndarray, 
     """Every count of arrivals per kind of sensor; receivers of one kind may hear different numbers of each."""
     kinds = range(len(system.sensors))
     most = [int((sender_kinds == kind).sum(axis=1).max()) if sender_kinds.size else 0 for kind in kinds]
-    number = int(np.prod([n + 1.0 for n in most]))
-    if number > MOST_OUTCOMES:
+    number, links = prod(n + 1 for n in most), sum(h[..., 0].size for h in {id(h): h for h in heard}.values())
+    if number * links * len(kinds) > MOST_WEIGHTS:
         raise UsageError(
-            f"method simplified: unlike agents make {number} sets of senders to average over (at most {MOST_OUTCOMES} "
-            "are evaluated); give fewer kinds of sensors, or --method monte-carlo, which draws them"
+            f"method simplified: unlike agents make {number} sets of senders to average over, of {links * len(kinds)} "
+            f"probabilities each (at most {MOST_WEIGHTS} in all are kept); give fewer kinds of sensors or rows, or "
+            "--method monte-carlo, which draws them, or --quantity optimal"
         )
-    counts = np.array(list(product(*(range(n + 1) for n in most))))
+    counts = np.indices([n + 1 for n in most], dtype=np.min_scalar_type(max(most) + 1)).reshape(len(most), -1).T
     weights, seen = [], {}
     for h in heard:
         if id(h) not in seen:
             seen[id(h)] = _outcome_weights(h, sender_kinds, counts, kinds)
         weights.append(seen[id(h)])
     if system.detects is None:
-        counts = counts + np.eye(len(kinds), dtype=int)[own]
+        counts[:, own] += 1
     return UnlikeCase(system.model, system.sensors, system.P0, shared, counts, weights)
 
 

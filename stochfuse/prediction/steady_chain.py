@@ -56,10 +56,7 @@ def starts(given: LosslessFilter, contacts: Contacts, period: int, row: int | No
         """G over a whole period."""
         for step in range(2, period + 2):
             V = np.tensordot(T[step - 2], V, axes=1) if T else V
-            V = np.concatenate(
-                [_after(given, V[here], count, step) for count, here in zip(counts, states, strict=True)]
-            )
-            V = V[np.argsort(np.concatenate(states))]
+            V = _after(given, V, contacts.held, step)
         return V
 
     sd = np.sqrt(np.diagonal(given.P0) + np.diagonal(given.model.Q, axis1=-2, axis2=-1).max(axis=0))

@@ -175,7 +175,7 @@ def possible_senders(architecture: str, agents: int) -> np.ndarray:
 def reachable(network: Network) -> np.ndarray:
     """Whether agent i may hear agent j, (n, n): by the architecture, and by network.hears."""
     n, there = network.agents, np.zeros((network.agents, network.agents), dtype=bool)
-    np.put_along_axis(there, possible_senders(network.architecture, n), True, axis=1)
+    there[np.arange(n)[:, None], possible_senders(network.architecture, n)] = True
     return there if network.hears is None else there & network.hears
 
 

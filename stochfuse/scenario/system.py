@@ -209,6 +209,8 @@ class System:
         noises, without an axis of items) as they were.
         """
         Q, R, P0 = noises
+        if noises.common:
+            return self
         model, sensors = self.model, self.sensors
         return replace(
             self,

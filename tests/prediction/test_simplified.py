@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.integrate import quad
 
 import stochfuse as sf
 from stochfuse.kalman.kernel import Estimate
@@ -253,12 +254,24 @@ def test_delay_is_refused_with_the_reason():
 
 
 def test_too_many_unlike_agents_are_refused_with_the_number():
-    source = mapping(1.0, 1.0, 1.0, 1.0, 1.0, agents=20, steps=2)
-    source["agent"] = [{"R": float(j)} for j in range(1, 21)]
+    source = mapping(1.0, 1.0, 1.0, 1.0, 1.0, agents=30, steps=2)
+    source["agent"] = [{"R": float(j)} for j in range(1, 31)]
     with pytest.raises(
-        sf.UsageError, match=r"unlike agents make 524288 sets of senders to average over \(at most 100000"
+        sf.UsageError, match=r"unlike agents make 536870912 sets of senders to average over, of 150 probabilities"
     ):
         sf.predict(sf.Scenario.from_mapping(source))
+
+
+def test_eighteen_unlike_agents_against_an_integral_over_all_sets_of_senders():
+    """1/x = ∫ t^(x−1) dt over t from 0 to 1, so that E[1/(1 + Σ s_j)] is the integral of a product over the senders."""
+    µ, R = 0.4, np.linspace(20.0, 300.0, 18)
+    source = mapping(1.0, 25.0, 1.0, 100.0, 100.0, agents=18, steps=2, link=µ) | {"agent": [{"R": r} for r in R]}
+    p = sf.predict(sf.Scenario.from_mapping(source), method="simplified")
+    prior = 100.0 * (1 - (1 - µ) ** 18) / (18 * µ) + 25.0
+    for i in (0, 17):
+        others = prior / np.delete(R, i)
+        left, _ = quad(lambda t, i=i, s=others: t ** (prior / R[i]) * np.prod(1 - µ + µ * t**s), 0.0, 1.0, epsabs=1e-12)
+        assert p.values(agent=i + 1)[0, 1] == pytest.approx(prior * left, rel=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -32,6 +32,8 @@ from tests.benchmarks.peers.ways import OURS, STONE_SOUP, Row, Section, agreed
 PRESET, AGENTS, STEPS, µ = "thesis-transient", 3, 5, 0.5
 Q, R, P0 = 25.0, 100.0, 100.0
 ACCURACY = 0.01
+IN_A_ROW = 20
+"""Exact answers timed together: one alone is mostly the time in which a processor gets its caches filled."""
 
 SENSOR = LinearGaussian(ndim_state=1, mapping=(0,), noise_covar=np.array([[R]]))
 ESTIMATE = LinearGaussian(ndim_state=1, mapping=(0,), noise_covar=np.array([[P0]]))
@@ -177,8 +179,8 @@ def section(quick: bool, rounds: int) -> Section:
     pilot = np.array([run(rng, OnNumPy()) for _ in range(100 if quick else 4000)])
     needed = np.ceil((pilot.std(axis=0, ddof=1) / exact / ACCURACY).max(axis=-1) ** 2).astype(int)
     questions = ("claimed", "actual")
-    (best, *sampled) = medians(
-        lambda: sf.predict(scenario, [µ], "optimal", "optimal").values(),
+    (in_a_row, *sampled) = medians(
+        lambda: [sf.predict(scenario, [µ], "optimal", "optimal").values() for _ in range(IN_A_ROW)],
         *(
             lambda asked=asked, runs=runs: ours(scenario, asked, int(runs)).values()
             for asked, runs in zip(questions, needed, strict=True)
@@ -186,7 +188,7 @@ def section(quick: bool, rounds: int) -> Section:
         rounds=rounds,
         clock=time.process_time,
     )
-    rows = []
+    rows, best = [], in_a_row / IN_A_ROW
     for index, (asked, mine) in enumerate(zip(questions, sampled, strict=True)):
         count = f"{needed[index]:,} runs"
         for by, runs in ((OnStoneSoup(), 100 if quick else 1000), (OnNumPy(), 100 if quick else 4000)):
@@ -201,7 +203,7 @@ def section(quick: bool, rounds: int) -> Section:
         own = float((np.abs(found.values()[0] - exact) / found.standard_error()[0]).max())
         agreed(f"stochfuse's Monte Carlo, {asked}, in standard errors", own, 4.0)
         rows.append(Row(OURS, f"predict, monte-carlo: {asked}", count, mine, mine / best, f"{own:.1f} s.e."))
-    rows.append(Row(OURS, "predict, optimal: both, exact", "1", best, 1.0, ""))
+    rows.append(Row(OURS, "predict, optimal: both, exact", f"{IN_A_ROW} in a row", best, 1.0, ""))
     work = (
         f"Monte Carlo to 1 % standard error, {PRESET}: {AGENTS} agents ad hoc, {STEPS} steps, µ = {µ}; per answer for "
         "all steps"
