@@ -92,14 +92,12 @@ class GraphLayer:
         small = len(states) <= MOST_STATES and most <= MOST_NODES and agents <= MOST_AGENTS and step < MOST_STEPS
         return small and not any(state.late for state in states)
 
-    def unions(self, heard: Sequence[int]) -> np.ndarray:
-        """Values of what some sets of agents know together, (states, sets)."""
-        return self._fuse(self._masks(heard))
-
     def commons(self, clauses: Sequence[Sequence[int]]) -> np.ndarray:
         """Values of what agents that heard some sets have in common, (states, sets of sets); −1 where it is nothing."""
-        masks = [np.bitwise_and.reduce(self._masks(heard), axis=1) for heard in clauses]
-        return self._fuse(np.stack(masks, axis=1)) if masks else np.zeros((len(self.states), 0), dtype=np.int64)
+        sets = sorted({heard for clause in clauses for heard in clause})
+        masks = dict(zip(sets, self._masks(sets).T, strict=True))
+        common = [np.bitwise_and.reduce([masks[heard] for heard in clause]) for clause in clauses]
+        return self._fuse(np.stack(common, axis=1))
 
     def after(self, heard: np.ndarray) -> tuple[np.ndarray, list[GraphState]]:
         """States before the next exchange, and which one follows on each state and outcome, (states, outcomes).
@@ -110,8 +108,8 @@ class GraphLayer:
         """
         sets, index = np.unique(heard, return_inverse=True)
         index = index.reshape(heard.shape)
-        masks, unions = self._masks(sets.tolist()), self.unions(sets.tolist())
-        values = _locals(self.estimator, unions, index)
+        masks = self._masks(sets.tolist())
+        values = _locals(self.estimator, self._fuse(masks), index)
         of = np.repeat(np.arange(len(self.states)), len(heard))
         known = masks[:, index].reshape(-1, self.agents)
         which, states = _Merging(self, of, known, values).merged()
@@ -244,25 +242,21 @@ class NaiveLayer:
         self.estimator = estimator
         self.values = np.array([state.agents for state in states])
 
-    def unions(self, heard: Sequence[int]) -> np.ndarray:
-        """Values of the sums of some sets of agents, (states, sets)."""
+    def commons(self, clauses: Sequence[Sequence[int]]) -> np.ndarray:
+        """Values of the sums of some sets of agents, (states, sets), each a clause of its own: nothing is common."""
         states, out = np.arange(len(self.values)), []
-        for h in heard:
+        for (h,) in clauses:
             members = [i for i in range(self.values.shape[1]) if h >> i & 1]
             terms, of = self.values[:, members].ravel(), np.repeat(states, len(members))
             ones = np.ones(len(terms), dtype=np.int64)
             out.append(self.estimator.ledger.combined(self.values[:, 0], of, terms, ones) if members[1:] else terms)
         return np.stack(out, axis=1)
 
-    def commons(self, clauses: Sequence[Sequence[int]]) -> np.ndarray:
-        """Nothing is taken for common."""
-        return np.full((len(self.values), len(clauses)), -1)
-
     def after(self, heard: np.ndarray) -> tuple[np.ndarray, list[NaiveState]]:
         """States before the next exchange, and which one follows on each state and outcome; see `GraphLayer`."""
         ledger, permutations = self.estimator.ledger, np.array(self.estimator.relabellings)
         sets, index = np.unique(heard, return_inverse=True)
-        values = _locals(self.estimator, self.unions(sets.tolist()), index.reshape(heard.shape))
+        values = _locals(self.estimator, self.commons(sets[:, None].tolist()), index.reshape(heard.shape))
         item, order = np.nonzero(_least(mixed(_mapped(values, ledger.invariant), 1), permutations))
         agents = np.take_along_axis(values[item], permutations[order], axis=1)
         agents = _moved(ledger, agents, order, permutations)

@@ -17,6 +17,7 @@ Values under numbers, when agents of one kind change places: what ledgers of sum
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from itertools import chain, pairwise, repeat
 from typing import Any
@@ -132,6 +133,10 @@ class Ledger(Renamed):
             atom = self._atom(MEASURED, step, source)
             atoms[atom] = atoms.get(atom, 0) + 1
         return self._value(step, tuple(sorted(atoms.items())))
+
+    def measurements(self, step: int, sources: Sequence[int]) -> int:
+        """Information of some sources' measurements at a step, and nothing else."""
+        return self._value(step, tuple(sorted(Counter(self._atom(MEASURED, step, of) for of in sources).items())))
 
     def forward(self, value: int, step: int) -> int:
         """Return the value brought forward to a later step by the time update (24)."""

@@ -187,16 +187,12 @@ class GraphExchange:
             if left == 0:
                 self._due[receiver] |= mask
 
-    def union(self, heard: int) -> int:
-        """Value of what the agents heard know together."""
-        return self.pedigrees.fuse(self.mask(heard))
-
-    def common(self, clauses: Sequence[int]) -> int | None:
-        """Value of what agents that heard those sets have in common, None if nothing."""
+    def common(self, clauses: Sequence[int]) -> int:
+        """Value of what agents that heard those sets have in common, −1 if nothing."""
         mask = -1
         for heard in clauses:
             mask &= self.mask(heard)
-        return self.pedigrees.fuse(mask) if mask else None
+        return self.pedigrees.fuse(mask) if mask else -1
 
     def fused(self, agent: int, heard: Sequence[int]) -> int:
         """Value that an agent claims after hearing some agents, with what else is due."""

@@ -100,12 +100,11 @@ class AdditiveEstimator(Estimator, Protocol):
 class AdditiveLayer(Protocol):
     """The exchanges of many states of an additive estimator, with nothing under way."""
 
-    def unions(self, heard: Sequence[int]) -> np.ndarray:
-        """Values of what would be fused from some sets of agents, (states, sets)."""
-        ...
-
     def commons(self, clauses: Sequence[Sequence[int]]) -> np.ndarray:
-        """Values of what agents that heard some sets have in common, (states, sets of sets); −1 where it is nothing."""
+        """Values of what agents that heard some sets have in common, (states, sets of sets); −1 where it is nothing.
+
+        One set alone: what would be fused from it.
+        """
         ...
 
     def after(self, heard: np.ndarray) -> tuple[np.ndarray, list[Any]]:

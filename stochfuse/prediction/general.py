@@ -137,7 +137,10 @@ def in_numbers(block: Claimed, values: Claims, step: int) -> Iterator[tuple[slic
     size = max(1, CHUNK // values.width)
     for first in range(0, block.number, size):
         some = slice(first, first + size)
-        yield some, *values.estimate([(sign, ids[some]) for sign, ids in block.terms], step)
+        terms = [(sign, ids[some]) for sign, ids in block.terms]
+        if block.view.always is not None:
+            terms.append((1, np.full_like(terms[0][1], block.view.always)))
+        yield some, *values.estimate(terms, step)
 
 
 def _rest(held: list[Claimed], found: Iterator[Claimed]) -> Iterator[Claimed]:

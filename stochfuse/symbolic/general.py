@@ -196,6 +196,7 @@ class GeneralForm:
             for ids, weight in zip(view.ids, ending.weights, strict=True):
                 for cell, factor in enumerate(factor_of):
                     parts = [(int(ids[index[cell]]), sign) for sign, index in view.terms]
+                    parts += [] if view.always is None else [(view.always, 1)]
                     value = ledger.combine(ending.step, [(v, sign) for v, sign in parts if v >= 0])
                     both = np.convolve(
                         np.convolve(_exact(weight), _exact(factor)),
