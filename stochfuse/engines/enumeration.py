@@ -511,15 +511,14 @@ class Claimed:
 
         Without the weight of any claim: for few numbers of many claims.
         """
-        columns, states, factors = np.ascontiguousarray(values.T), self.states, self.view.factors
-        starts, weighed = self.view.starts, self.bookkeeping.weighed
-        found = np.zeros((states.shape[1], len(columns), len(factors)))
-        size = max(1, LISTED // (self.which.shape[1] * len(columns)))
-        for first in range(0, len(states), size):
+        found, columns, cells = 0.0, np.ascontiguousarray(values.T), self.which.shape[1]
+        size = max(1, LISTED // (cells * len(columns)))
+        for first in range(0, len(self.which), size):
             some = slice(first, first + size)
-            by_factor = np.add.reduceat(columns.take(self.which[some], axis=1), starts, axis=2)
-            found += np.tensordot(states[some], by_factor, axes=((0,), (1,)))
-        return self.shared(sum(weighed(found[..., f], factor) for f, factor in enumerate(factors)))
+            by_factor = np.add.reduceat(columns.take(self.which[some], axis=1), self.view.starts, axis=2)
+            found += np.tensordot(self.states[some], by_factor, axes=((0,), (1,)))
+        factors = enumerate(self.view.factors)
+        return self.shared(sum(self.bookkeeping.weighed(found[..., f], factor) for f, factor in factors))
 
     def shared(self, found: np.ndarray) -> np.ndarray:
         """What is known before the last exchange counts, (width, ...), after it: (groups, full width, ...)."""

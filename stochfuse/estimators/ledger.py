@@ -103,7 +103,6 @@ class Ledger(Renamed):
         self.sums: list[Atoms] = []
         self._atom_of: dict[tuple[str, int, int], int] = {}
         self._value_of: dict[tuple[int, Atoms], int] = {}
-        self._prior_of: dict[int, int] = {}
         self._local_of: dict[tuple[int, int | None], int] = {}
         self._random, self._steps = np.random.default_rng(0), np.zeros(0, dtype=np.int64)
         self._pairs, self._ends = np.zeros((0, 2), dtype=np.int64), np.zeros(1, dtype=np.int64)
@@ -141,11 +140,7 @@ class Ledger(Renamed):
     def forward(self, value: int, step: int) -> int:
         """Return the value brought forward to a later step by the time update (24)."""
         while self.step[value] < step:
-            known = self._prior_of.get(value)
-            if known is None:
-                later = self.step[value] + 1
-                known = self._prior_of[value] = self._value(later, ((self._atom(PRIOR, later, value), 1),))
-            value = known
+            value = self.local(value, None)
         return value
 
     def combine(self, step: int, terms: Iterable[tuple[int, int]]) -> int:
@@ -196,20 +191,24 @@ class Ledger(Renamed):
     def locals(self, values: np.ndarray, source: int | None) -> np.ndarray:
         """Return many local estimates at a time, see `local`."""
         found, which = np.unique(values, return_inverse=True)
-        asked = [(value, source) for value in found.tolist()]
-        new = [value for value, _ in asked if (value, source) not in self._local_of]
+        asked = list(zip(found.tolist(), repeat(source)))
+        new = [pair for pair in asked if pair not in self._local_of]
         if new:
-            step = self.step[new[0]] + 1
+            step = self.step[new[0][0]] + 1
             measured = () if source is None else ((self._atom(MEASURED, step, source), 1),)
-            sums = [tuple(sorted((*measured, (self._atom(PRIOR, step, value), 1)))) for value in new]
-            self._local_of.update(zip(zip(new, repeat(source)), self._values(repeat(step), sums), strict=False))
+            priors = [(PRIOR, step, value) for value, _ in new]
+            self.atoms += _added(priors, self._atom_of)
+            sums = [tuple(sorted((*measured, (self._atom_of[prior], 1)))) for prior in priors]
+            self._local_of.update(zip(new, self._values(repeat(step), sums), strict=True))
         return np.array([self._local_of[pair] for pair in asked])[which].reshape(values.shape)
 
     def forwards(self, values: np.ndarray, step: int) -> np.ndarray:
         """Return many values brought forward, see `forward`; −1 stays."""
-        found, which = np.unique(values, return_inverse=True)
-        new = [value if value < 0 else self.forward(value, step) for value in found.tolist()]
-        return np.array(new)[which].reshape(values.shape)
+        out = values.copy()
+        since = np.where(values < 0, step, self.steps[values])
+        for now in range(int(since.min(initial=step)), step):
+            out[since <= now] = self.locals(out[since <= now], None)
+        return out
 
     def _forwarded(self, values: np.ndarray, steps: np.ndarray) -> np.ndarray:
         out = values.copy()
@@ -279,8 +278,7 @@ class Ledger(Renamed):
     def _values(self, steps: Iterable[int], sums: Sequence[Atoms]) -> list[int]:
         """Return the numbers of different sums, of a step each."""
         keys = list(zip(steps, sums, strict=False))
-        new = [key for key in keys if key not in self._value_of]
-        self._value_of.update(zip(new, range(len(self.sums), len(self.sums) + len(new)), strict=True))
+        new = _added(keys, self._value_of)
         self.step += [step for step, _ in new]
         self.sums += [atoms for _, atoms in new]
         return [self._value_of[key] for key in keys]
@@ -293,6 +291,13 @@ class Ledger(Renamed):
             self.sums.append(atoms)
             self.step.append(step)
         return known
+
+
+def _added(keys: Sequence[Any], numbers: dict[Any, int]) -> list[Any]:
+    """Return those of some different keys that have no number yet, after giving them the next ones."""
+    new = [key for key in keys if key not in numbers]
+    numbers.update(zip(new, range(len(numbers), len(numbers) + len(new)), strict=True))
+    return new
 
 
 def different(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -451,8 +456,8 @@ class InformationClaims:
 
     def __init__(self, information: Information) -> None:
         d = information.Y.shape[-1]
-        # beside each other they would be copied whenever some are added up
-        y, Y = (None if part is None else np.ascontiguousarray(part) for part in information)
+        # beside each other they would be copied whenever some are added up; at −1 stands nothing
+        y, Y = (None if part is None else np.concatenate([part, 0.0 * part[:1]]) for part in information)
         self.information = Information(y, Y)
         items = information.Y[0].size // d**2
         self.width = items * d * max(d, 0 if y is None else y.shape[-1])
@@ -465,16 +470,18 @@ class InformationClaims:
         NoAnswerError
             If some sum is no positive-definite information.
         """
-        which = np.stack([values.ravel() for _, values in terms], axis=1)
-        signs = np.where(which < 0, 0.0, [sign for sign, _ in terms]).ravel()
-        ends = np.arange(0, which.size + 1, len(terms))
-        parts = [part for part in self.information if part is not None]
-        found = [
-            part.reshape(*terms[0][1].shape, *part.shape[1:])
-            for part in _summed(parts, signs, np.maximum(which, 0).ravel(), ends)
-        ]
-        estimate, magnified = estimated(Information(None if len(found) == 1 else found[0], found[-1]), step)
+        found = [None if part is None else self._total(part, terms) for part in self.information]
+        estimate, magnified = estimated(Information(*found), step)
         return estimate, magnified.max(axis=(0, -1))
+
+
+    @staticmethod
+    def _total(part: np.ndarray, terms: Sequence[tuple[int, np.ndarray]]) -> np.ndarray:
+        (sign, first), *others = terms
+        total = sign * part.take(first, axis=0)
+        for sign, values in others:
+            (np.add if sign > 0 else np.subtract)(total, part.take(values, axis=0), out=total)
+        return total
 
 
 def _summed(parts: Sequence[np.ndarray], times: np.ndarray, which: np.ndarray, ends: np.ndarray) -> list[np.ndarray]:

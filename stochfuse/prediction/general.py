@@ -58,7 +58,7 @@ KEPT = 8
 """Structures kept for what is asked next."""
 HELD = 1 << 24
 """Weights of claims that are held, and not found again when they are needed again."""
-CHUNK = 1 << 21
+CHUNK = 1 << 17
 """Numbers of estimates that are worked on at a time."""
 BLOCK = 1 << 20
 """Numbers that the values of a block of items take."""
@@ -139,7 +139,7 @@ def in_numbers(block: Claimed, values: Claims, step: int) -> Iterator[tuple[slic
         some = slice(first, first + size)
         terms = [(sign, ids[some]) for sign, ids in block.terms]
         if block.view.always is not None:
-            terms.append((1, np.full_like(terms[0][1], block.view.always)))
+            terms.append((1, np.array([block.view.always])))
         yield some, *values.estimate(terms, step)
 
 
