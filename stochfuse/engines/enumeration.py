@@ -382,8 +382,10 @@ def _two_step_ending(
 def _rows_once(ids: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """States of which everything is equal that is still asked for as one, with their weights added up."""
     random = np.random.default_rng(3).integers(1 << 64, size=(2, ids.shape[1]), dtype=np.uint64)
-    order, starts = different(random @ ids.T.view(np.uint64))
-    return ids[order[starts]], np.add.reduceat(weights[order], starts, axis=0)
+    which, one = numbered(random @ ids.T.view(np.uint64))
+    total = np.zeros((len(one), weights.shape[1]))
+    np.add.at(total, which, weights)
+    return ids[one], total
 
 
 def _members(agents: int, n: int) -> list[int]:
@@ -469,7 +471,7 @@ class Claimed:
     Parameters
     ----------
     terms : (sign, values (claims,)), without what is part of all; the value −1 stands for nothing.
-    which : number of the claim in every outcome, (states, cells).
+    which : number of the claim in every outcome, (states, cells), or None where each has its own.
     view : the outcomes.
     states : weight of every state, on the weights' axis.
     events : events up to the step.
@@ -477,7 +479,7 @@ class Claimed:
     """
 
     terms: tuple[tuple[int, np.ndarray], ...]
-    which: np.ndarray
+    which: np.ndarray | None
     view: FusedSet
     states: np.ndarray
     events: int
@@ -500,22 +502,21 @@ class Claimed:
 
         total, factor_of = np.zeros((self.number, self.width)), self._factor_of
         for some, pairs in self._pairs():
-            which = self.which[some].ravel()
+            which = self._of(np.arange(self.number)[None], some).ravel()
             pair_of = (np.arange(len(pairs))[:, None] * pairs.shape[1] + factor_of).ravel()
             places = (np.ones(len(which)), (which, pair_of))
             total += csr_array(places, shape=(self.number, pairs[:, :, 0].size)) @ pairs.reshape(-1, self.width)
         return np.ascontiguousarray(total.T)
 
     def expected(self, values: np.ndarray) -> np.ndarray:
-        """Σ weight · values (claims, numbers) for every group of agents, (groups, full width, numbers).
+        """Σ weight · values (numbers, claims) for every group of agents, (groups, full width, numbers).
 
         Without the weight of any claim: for few numbers of many claims.
         """
-        found, columns, cells = 0.0, np.ascontiguousarray(values.T), self.which.shape[1]
-        size = max(1, LISTED // (cells * len(columns)))
-        for first in range(0, len(self.which), size):
+        found, size = 0.0, max(1, LISTED // (self._cells * len(values)))
+        for first in range(0, len(self.states), size):
             some = slice(first, first + size)
-            by_factor = np.add.reduceat(columns.take(self.which[some], axis=1), self.view.starts, axis=2)
+            by_factor = np.add.reduceat(self._of(values, some), self.view.starts, axis=2)
             found += np.tensordot(self.states[some], by_factor, axes=((0,), (1,)))
         factors = enumerate(self.view.factors)
         return self.shared(sum(self.bookkeeping.weighed(found[..., f], factor) for f, factor in factors))
@@ -530,13 +531,23 @@ class Claimed:
         return np.stack([np.zeros(shape) if part is None else part for part in by_group])
 
     @property
+    def _cells(self) -> int:
+        return len(self.view.terms[0][1])
+
+    def _of(self, values: np.ndarray, some: slice) -> np.ndarray:
+        """Values (numbers, claims) of what is claimed in some states, (numbers, states, cells)."""
+        if self.which is None:
+            return values.reshape(len(values), -1, self._cells)[:, some]
+        return values.take(self.which[some], axis=1)
+
+    @property
     def _factor_of(self) -> np.ndarray:
-        return np.repeat(np.arange(len(self.view.factors)), np.diff([*self.view.starts, self.which.shape[1]]))
+        return np.repeat(np.arange(len(self.view.factors)), np.diff([*self.view.starts, self._cells]))
 
     def _pairs(self) -> Iterator[tuple[slice, np.ndarray]]:
         """Weights of some states with every factor, (states, factors, width), at a time."""
-        size = max(1, LISTED // max(self.which.shape[1], len(self.view.factors) * self.width))
-        for first in range(0, len(self.which), size):
+        size = max(1, LISTED // max(self._cells, len(self.view.factors) * self.width))
+        for first in range(0, len(self.states), size):
             some = slice(first, first + size)
             yield some, self.bookkeeping.pairs(self.states[some], self.view.factors)
 
@@ -556,12 +567,13 @@ def claims_of(ending: Ending, signatures: np.ndarray | None, weights: Weights) -
         alike = len(different_ones) < WORTH * cells * len(view.ids[tried])
         for first in range(0, len(view.ids), size):
             states = slice(first, first + size)
-            ids, order, which = view.ids[states], np.arange(len(view.ids[states]) * cells), None
+            ids, which = view.ids[states], None
             if alike:
                 which, order = numbered(_keys(view, states, signatures))
-            row, cell = np.divmod(order, cells)
-            terms = tuple((sign, ids[row, index[cell]]) for sign, index in view.terms)
-            which = (order if which is None else which).astype(np.int32).reshape(-1, cells)
+                which, (row, cell) = which.astype(np.int32).reshape(-1, cells), np.divmod(order, cells)
+                terms = tuple((sign, ids[row, index[cell]]) for sign, index in view.terms)
+            else:
+                terms = tuple((sign, ids.take(index, axis=1).ravel()) for sign, index in view.terms)
             yield Claimed(terms, which, view, ending.weights[states], ending.events, weights)
 
 

@@ -165,14 +165,12 @@ class Ledger(Renamed):
         brought = self._forwarded(values, step[of])
         starts = np.searchsorted(of, np.arange(len(like)))
         signed = times.view(np.uint64)[:, None] * self.signatures()[brought]
-        order, first = different(np.ascontiguousarray(np.add.reduceat(signed, starts, axis=0).T))
+        which, first = numbered(np.ascontiguousarray(np.add.reduceat(signed, starts, axis=0).T))
         number = np.full(len(like), -1)
-        number[order[first]] = np.arange(len(first))
+        number[first] = np.arange(len(first))
         one = np.flatnonzero(number[of] >= 0)
         sums = self._added_up(number[of[one]], brought[one], times[one], len(first))
-        out = np.empty(len(like), dtype=np.int64)
-        out[order] = np.repeat(self._values(step[order[first]].tolist(), sums), np.diff([*first, len(order)]))
-        return out
+        return np.array(self._values(step[first].tolist(), sums))[which]
 
     def _added_up(self, of: np.ndarray, values: np.ndarray, times: np.ndarray, sums: int) -> list[Atoms]:
         """Return so many sums, Σ times · value over the terms of each."""
@@ -313,11 +311,14 @@ def different(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def numbered(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Number of every key among the different ones, and where one of each of these is; see `different`."""
+    """Number of every key among the different ones, and where one of each of these is, in order; see `different`."""
     order, starts = different(keys)
-    which = np.empty(len(order), dtype=np.int64)
-    which[order] = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(order)))
-    return which, order[starts]
+    which, number = np.empty((2, len(order)), dtype=np.int64)
+    # what is used together stays together in memory
+    one = np.sort(order[starts])
+    number[one] = np.arange(len(one))
+    which[order] = np.repeat(number[order[starts]], np.diff(starts, append=len(order)))
+    return which, one
 
 
 class Sources:
@@ -473,7 +474,6 @@ class InformationClaims:
         found = [None if part is None else self._total(part, terms) for part in self.information]
         estimate, magnified = estimated(Information(*found), step)
         return estimate, magnified.max(axis=(0, -1))
-
 
     @staticmethod
     def _total(part: np.ndarray, terms: Sequence[tuple[int, np.ndarray]]) -> np.ndarray:
