@@ -14,13 +14,13 @@ messages under way, more nodes than a word has bits.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
 
-from stochfuse.estimators.ledger import Ledger, numbered
+from stochfuse.estimators.ledger import Ledger, mapped, numbered
 from stochfuse.estimators.protocol import FusionRule
 
 MOST_NODES, MOST_STATES = 48, 1 << 14
@@ -185,7 +185,7 @@ class _Merging:
         self.nodes, self.below = layer.values[of], (layer.below[of] & kept[:, None]) * self.kept
         # ancestors first: an earlier step, or fewer ancestors within one
         rank = ledger.steps[self.nodes] << 6 | np.bitwise_count(self.below).astype(np.int64)
-        self.rank = (rank << 32 | _mapped(self.nodes, ledger.invariant)) << n
+        self.rank = (rank << 32 | _invariants(ledger, self.nodes)) << n
         self.holders = self.known[:, None, :] >> bits[:, None] & 1
         self.most = int(self.kept.sum(axis=1).max())
 
@@ -209,12 +209,12 @@ class _Merging:
         above = above.astype(np.uint64)
         kin = who[same].astype(np.uint64)
         for _ in range(ROUNDS):
-            over = (above * mixed(kin, 0)[:, None, :]).sum(axis=2)
-            kin = mixed(over + (above * mixed(kin, 1)[:, :, None]).sum(axis=1) + mixed(kin, 2), 3)
+            over = np.einsum("spq,sq->sp", above, mixed(kin, 0)) + np.einsum("spq,sp->sq", above, mixed(kin, 1))
+            kin = mixed(over + mixed(kin, 2), 3)
         at[same] = np.lexsort((kin, who[same]))
         for _ in range(ROUNDS):  # what is alike still, by the places that its ancestors have now
             place = np.argsort(at[same], axis=1)
-            by_place = (above * mixed(place, 0)[:, None, :] * (place[:, None, :] != place[:, :, None])).sum(axis=2)
+            by_place = np.einsum("spq,sq->sp", above, mixed(place, 0)) - mixed(place, 0)
             at[same] = np.lexsort((by_place, kin, who[same]))
         return at
 
@@ -222,7 +222,7 @@ class _Merging:
         """Relabellings that put the agents of each item into their least order, (items, relabellings)."""
         tokens = mixed(self.rank + self.holders.sum(axis=-1), 3)
         theirs = (self.holders.astype(np.uint64) * tokens[:, :, None]).sum(axis=1)
-        return _least(mixed(theirs + mixed(_mapped(self.values, self.ledger.invariant), 2), 1), self.permutations)
+        return _least(mixed(theirs + mixed(_invariants(self.ledger, self.values), 2), 1), self.permutations)
 
     def _rows(self, item: np.ndarray, order: np.ndarray, at: np.ndarray) -> list[np.ndarray]:
         """Values and pedigrees of nodes, −1 and 0 beyond the last, and of agents, renamed."""
@@ -257,7 +257,7 @@ class NaiveLayer:
         ledger, permutations = self.estimator.ledger, np.array(self.estimator.relabellings)
         sets, index = np.unique(heard, return_inverse=True)
         values = _locals(self.estimator, self.commons(sets[:, None].tolist()), index.reshape(heard.shape))
-        item, order = np.nonzero(_least(mixed(_mapped(values, ledger.invariant), 1), permutations))
+        item, order = np.nonzero(_least(mixed(_invariants(ledger, values), 1), permutations))
         agents = np.take_along_axis(values[item], permutations[order], axis=1)
         agents = _moved(ledger, agents, order, permutations)
         which, first = _one_of_each(item, [agents])
@@ -291,8 +291,12 @@ def _moved(ledger: Ledger, values: np.ndarray, order: np.ndarray, permutations: 
     out = np.empty_like(values)
     for number in np.unique(order).tolist():
         here, permutation = np.flatnonzero(order == number), tuple(permutations[number].tolist())
-        out[here] = _mapped(values[here], lambda value: ledger.moved(value, permutation))  # noqa: B023
+        out[here] = mapped(values[here], lambda some: [ledger.moved(value, permutation) for value in some])  # noqa: B023
     return out
+
+
+def _invariants(ledger: Ledger, values: np.ndarray) -> np.ndarray:
+    return mapped(values, lambda some: [ledger.invariant(value) for value in some])
 
 
 def _one_of_each(item: np.ndarray, rows: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -355,12 +359,6 @@ def _renumbered(masks: np.ndarray, at: np.ndarray) -> np.ndarray:
     for place in range(at.shape[1]):
         out |= (masks >> at[:, place, None] & 1) << place
     return out
-
-
-def _mapped(values: np.ndarray, function: Callable[[int], int]) -> np.ndarray:
-    """Return what a function makes of values that are not negative, each asked for once."""
-    found, which = np.unique(values, return_inverse=True)
-    return np.array([value if value < 0 else function(value) for value in found.tolist()])[which].reshape(values.shape)
 
 
 def _flat(pairs: Sequence[Sequence[tuple[int, int]]]) -> np.ndarray:

@@ -188,17 +188,20 @@ class Ledger(Renamed):
 
     def locals(self, values: np.ndarray, source: int | None) -> np.ndarray:
         """Return many local estimates at a time, see `local`."""
-        found, which = np.unique(values, return_inverse=True)
-        asked = list(zip(found.tolist(), repeat(source)))
-        new = [pair for pair in asked if pair not in self._local_of]
-        if new:
-            step = self.step[new[0][0]] + 1
-            measured = () if source is None else ((self._atom(MEASURED, step, source), 1),)
-            priors = [(PRIOR, step, value) for value, _ in new]
-            self.atoms += _added(priors, self._atom_of)
-            sums = [tuple(sorted((*measured, (self._atom_of[prior], 1)))) for prior in priors]
-            self._local_of.update(zip(new, self._values(repeat(step), sums), strict=True))
-        return np.array([self._local_of[pair] for pair in asked])[which].reshape(values.shape)
+
+        def known(different: list[int]) -> list[int]:
+            asked = list(zip(different, repeat(source)))
+            new = [pair for pair in asked if pair not in self._local_of]
+            if new:
+                step = self.step[new[0][0]] + 1
+                measured = () if source is None else ((self._atom(MEASURED, step, source), 1),)
+                priors = [(PRIOR, step, value) for value, _ in new]
+                self.atoms += _added(priors, self._atom_of)
+                sums = [tuple(sorted((*measured, (self._atom_of[prior], 1)))) for prior in priors]
+                self._local_of.update(zip(new, self._values(repeat(step), sums), strict=True))
+            return [self._local_of[pair] for pair in asked]
+
+        return mapped(values, known)
 
     def forwards(self, values: np.ndarray, step: int) -> np.ndarray:
         """Return many values brought forward, see `forward`; −1 stays."""
@@ -296,6 +299,14 @@ def _added(keys: Sequence[Any], numbers: dict[Any, int]) -> list[Any]:
     new = [key for key in keys if key not in numbers]
     numbers.update(zip(new, range(len(numbers), len(numbers) + len(new)), strict=True))
     return new
+
+
+def mapped(values: np.ndarray, function: Callable[[list[int]], list[int]]) -> np.ndarray:
+    """Return what a function makes of the different ones of some values; −1 stays."""
+    found = np.flatnonzero(np.bincount(values.ravel() + 1, minlength=1)[1:])
+    table = np.full(found.max(initial=-1) + 2, -1)
+    table[found] = function(found.tolist())
+    return table[values]
 
 
 def different(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -128,8 +128,11 @@ class Claims(Protocol):
     width: int
 
     def estimate(self, terms: Sequence[tuple[int, np.ndarray]], step: int) -> tuple[Any, Any]:
-        """Estimates of a step, Σ sign · value over (sign, values of any shape, that of the first or one for all), and by
-        how much rounding grew, one number or one for each item of a batch.
+        """Estimates of a step, and by how much rounding grew, one number or one for each item of a batch.
+
+        Parameters
+        ----------
+        terms : sign and values, of any one shape or, but for the first, a value for all: Σ sign · value is claimed.
 
         An `Estimate` of P (..., d, d) and x (..., d, columns), which holds data or a noise footprint or is None; or the
         `Moments` of the error themselves.

@@ -173,7 +173,7 @@ class GeneralForm:
         labels = kinds if self.quantity == CLAIMED else tuple(range(self.agents))
         permutations = relabellings(network, rows, kinds)
         drawn = events(network, rows, 1)
-        weights = CountWeights(self.step * len(drawn) + 1)
+        weights = CountWeights(self.step * len(drawn))
         ledger = Ledger(None if self.quantity == CLAIMED else kinds)
         estimator = rule_of(self.estimator)(ledger, labels, shared=self.shared, relabellings=permutations)
         groups = tuple(orbits(self.agents, permutations))
