@@ -339,8 +339,10 @@ class CountWeights(_Polynomial):
     def table(self, weights: Sequence[Any], degree: int) -> np.ndarray:
         """Numbers of outcomes by number of successes, shape (weights, degree + 1)."""
         size = self.bits // 8
-        digits = b"".join([w.to_bytes(size * (degree + 1), "little") for w in weights])
-        return np.frombuffer(digits, np.uint8).reshape(len(weights), degree + 1, size) @ 256.0 ** np.arange(size)
+        packed = b"".join([w.to_bytes(size * (degree + 1), "little") for w in weights])
+        digits = np.frombuffer(packed, np.uint8).reshape(len(weights), degree + 1, size)
+        used = 1 + np.flatnonzero(digits.any(axis=(0, 1))).max()
+        return digits[..., :used] @ np.array([256.0**place for place in range(used)])
 
     def factors(self, factors: Sequence[Any], degree: int) -> np.ndarray:
         """Outcomes' factors as coefficients, shape (factors, degree + 1)."""
