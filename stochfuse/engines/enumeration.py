@@ -458,7 +458,7 @@ class _LastViews:
         if together is not None:
             commons = together.commons(self._clauses)
         else:
-            exchanges = [self.estimator.exchange(state) for state in states]
+            exchanges: list[Any] = [self.estimator.exchange(state) for state in states]
             commons = np.array([[exchange.common(clauses) for clauses in self._clauses] for exchange in exchanges])
         # the union of what all know is never nothing
         return ledger.forwards(commons, int(ledger.steps[commons.max()]) + 1)
@@ -513,13 +513,14 @@ class Claimed:
 
         Without the weight of any claim: for few numbers of many claims.
         """
-        found, size = 0.0, max(1, LISTED // (self._cells * len(values)))
+        factors, size = self.view.factors, max(1, LISTED // (self._cells * len(values)))
+        found = np.zeros((self.states.shape[1], len(values), len(factors)))
         for first in range(0, len(self.states), size):
             some = slice(first, first + size)
             by_factor = np.add.reduceat(self._of(values, some), self.view.starts, axis=2)
             found += np.tensordot(self.states[some], by_factor, axes=((0,), (1,)))
-        factors = enumerate(self.view.factors)
-        return self.shared(sum(self.bookkeeping.weighed(found[..., f], factor) for f, factor in factors))
+        weighed = [self.bookkeeping.weighed(found[..., f], factor) for f, factor in enumerate(factors)]
+        return self.shared(np.sum(weighed, axis=0))
 
     def shared(self, found: np.ndarray) -> np.ndarray:
         """What is known before the last exchange counts, (width, ...), after it: (groups, full width, ...)."""

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stochfuse.estimators.ledger import Ledger, mapped, numbered
+from stochfuse.estimators.ledger import Ledger, hashes, mapped, numbered
 from stochfuse.estimators.protocol import FusionRule
 
 MOST_NODES, MOST_STATES = 48, 1 << 14
@@ -30,7 +30,7 @@ MOST_AGENTS, MOST_STEPS = 7, 1 << 8
 ROUNDS = 2
 """Times that nodes with equal keys are told by their kin, and by the kin of these."""
 _LAST = np.iinfo(np.int64).max
-_RANDOM = np.random.default_rng(7).integers(1 << 64, size=(2, 4, 64), dtype=np.uint64) | np.uint64(1)
+_RANDOM = np.random.default_rng(7).integers(1 << 64, size=(2, 4), dtype=np.uint64) | np.uint64(1)
 
 
 class HeldEstimate(NamedTuple):
@@ -179,10 +179,13 @@ class _Merging:
         ledger, n = layer.estimator.ledger, layer.agents
         self.ledger, self.values = ledger, values
         self.permutations = np.array(layer.estimator.relabellings)
-        kept = _reachable(known, layer.below[of])
+        below = layer.below[of]
+        same, one = numbered(hashes(np.concatenate([np.sort(known, axis=1), below], axis=1)))
+        structures = zip(below[one].tolist(), known[one].tolist(), strict=True)
+        kept = np.array([reachable(*structure) for structure in structures])[same]
         bits = np.arange(layer.below.shape[1])
         self.known, self.kept = known & kept[:, None], kept[:, None] >> bits & 1 == 1
-        self.nodes, self.below = layer.values[of], (layer.below[of] & kept[:, None]) * self.kept
+        self.nodes, self.below = layer.values[of], (below & kept[:, None]) * self.kept
         # ancestors first: an earlier step, or fewer ancestors within one
         rank = ledger.steps[self.nodes] << 6 | np.bitwise_count(self.below).astype(np.int64)
         self.rank = (rank << 32 | _invariants(ledger, self.nodes)) << n
@@ -304,7 +307,7 @@ def _one_of_each(item: np.ndarray, rows: Sequence[np.ndarray]) -> tuple[np.ndarr
 
     Of several rows of an item, which are next to each other, one that all items of a kind agree upon.
     """
-    keys = _hashes(rows)
+    keys = hashes(np.concatenate(rows, axis=1))
     first = np.lexsort((keys[0], item))
     first = first[np.flatnonzero(np.diff(item[first], prepend=-1))]
     which, one = numbered(keys[:, first])
@@ -320,37 +323,33 @@ def _states(rows: Sequence[np.ndarray]) -> list[GraphState]:
     ]
 
 
-def _reachable(known: np.ndarray, below: np.ndarray) -> np.ndarray:
-    """Nodes that a later search can meet, as masks; see `Pedigrees.reachable`."""
-    which, one = numbered(_hashes([known, below]))
-    known, below = known[one], below[one]
-    kept, done = np.zeros(len(known), dtype=np.int64), np.zeros(len(known), dtype=np.int64)
+def reachable(below: Sequence[int], known: Sequence[int], kept: int = 0) -> int:
+    """Nodes that a later search can meet: given ones, and the maximal ones of any two pedigrees' intersection.
 
-    def meet(some: np.ndarray, shared: np.ndarray) -> None:
-        while len(some):
-            here = shared != 0
-            some, shared = some[here], shared[here]
-            top = highest(shared)
-            kept[some] |= 1 << top
-            shared = shared & ~below[some, top]
-
-    everyone = np.arange(len(known))
-    for i in range(known.shape[1]):
-        for j in range(i):
-            meet(everyone, known[:, i] & known[:, j])
-    while (kept & ~done).any():
-        for node in range(below.shape[1]):
-            here = np.flatnonzero((kept & ~done) >> node & 1)
-            own = below[here, node]
-            others = [known[here, i] for i in range(known.shape[1])]
-            others += [below[here, other] * (done[here] >> other & 1) for other in range(below.shape[1])]
-            for other in others if len(here) else ():
-                shared = own & other
-                # what one of the two holds wholly has that one for its latest node
-                new = np.flatnonzero((shared != own) & (shared != other))
-                meet(here[new], shared[new])
-            done[here] |= 1 << node
-    return kept[which]
+    Parameters
+    ----------
+    below : pedigree of each node.
+    known : pedigrees that a search can begin with.
+    kept : nodes that it can meet whatever else it does.
+    """
+    done: set[int] = set()
+    members = [*known, *(below[n] for n in range(kept.bit_length()) if kept >> n & 1)]
+    i = 1
+    while i < len(members):
+        mask = members[i]
+        for other in members[:i]:
+            shared = mask & other
+            if shared in done:
+                continue
+            done.add(shared)
+            while shared:
+                top = shared.bit_length() - 1
+                if not kept >> top & 1:
+                    kept |= 1 << top
+                    members.append(below[top])
+                shared &= ~below[top]
+        i += 1
+    return kept
 
 
 def _renumbered(masks: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -373,17 +372,7 @@ def highest(masks: np.ndarray) -> np.ndarray:
 
 def mixed(numbers: np.ndarray, way: int) -> np.ndarray:
     """Whole numbers scattered over 64 bits, in one of some ways."""
-    out = numbers.astype(np.uint64) * _RANDOM[0, way, 0]
+    out = numbers.astype(np.uint64) * _RANDOM[0, way]
     out ^= out >> np.uint64(32)
-    out *= _RANDOM[1, way, 0]
+    out *= _RANDOM[1, way]
     return out ^ out >> np.uint64(29)
-
-
-def _hashes(parts: Sequence[np.ndarray]) -> np.ndarray:
-    """Two numbers of 64 bits for every row of some arrays, (2, rows)."""
-    out = np.zeros((2, len(parts[0])), dtype=np.uint64)
-    for part, random in zip(parts, np.moveaxis(_RANDOM, 1, 0), strict=False):
-        for column, factors in zip(part.T, random.T, strict=False):
-            for way, factor in enumerate(factors):
-                out[way] += mixed((column.astype(np.uint64) + np.uint64(1)) * factor, way)
-    return out

@@ -45,6 +45,7 @@ MANY = 1 << 14
 """Terms from which on sums are added up by a sparse product, several times faster."""
 COMMON = -1
 """Source of an initial estimate that all agents share."""
+_RANDOM = np.random.default_rng(5).integers(1 << 64, size=(2, 2, 1 << 13), dtype=np.uint64) | np.uint64(1)
 
 
 class Renamed:
@@ -319,6 +320,19 @@ def different(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         order = np.lexsort(keys[::-1])
         new = (keys[:, order[1:]] != keys[:, order[:-1]]).any(axis=0)
     return order, np.flatnonzero(np.concatenate([[True], new]))
+
+
+def hashes(words: np.ndarray, numbers: int = 2) -> np.ndarray:
+    """Return 1 or 2 numbers of 64 bits for every row of up to 2^13 words, (numbers, rows)."""
+    words = words.view(np.uint64)
+    out = np.empty((numbers, len(words)), dtype=np.uint64)
+    for total, (one, other) in zip(out, _RANDOM, strict=False):
+        mixed = words * one[: words.shape[1]]
+        mixed ^= mixed >> np.uint64(32)
+        np.einsum("ij,j->i", mixed, other[: words.shape[1]], out=total)
+        total ^= total >> np.uint64(32)
+        total *= other[-1]
+    return out
 
 
 def numbered(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -30,7 +30,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from stochfuse.errors import TooManyError
-from stochfuse.estimators.layers import GraphLayer, GraphState, HeldEstimate
+from stochfuse.estimators.layers import GraphLayer, GraphState, HeldEstimate, reachable
 from stochfuse.estimators.ledger import COMMON, Ledger
 from stochfuse.estimators.protocol import AdditiveLayer, FusionRule, Late, best_relabelling
 
@@ -98,33 +98,6 @@ class Pedigrees:
     def know(self, mask: int, value: int) -> None:
         """Remember what a pedigree is worth, so that no search goes below it."""
         self._known[mask] = value
-
-    def reachable(self, known: Sequence[int], kept: int = 0) -> int:
-        """Nodes that a later search can meet: given ones, and the maximal ones of any two pedigrees' intersection.
-
-        Parameters
-        ----------
-        known : pedigrees that a search can begin with.
-        kept : nodes that it can meet whatever else it does.
-        """
-        below, done = self.below, set()
-        members = [*known, *(below[n] for n in range(kept.bit_length()) if kept >> n & 1)]
-        i = 1
-        while i < len(members):
-            mask = members[i]
-            for other in members[:i]:
-                shared = mask & other
-                if shared in done:
-                    continue
-                done.add(shared)
-                while shared:
-                    top = shared.bit_length() - 1
-                    if not kept >> top & 1:
-                        kept |= 1 << top
-                        members.append(below[top])
-                    shared &= ~below[top]
-            i += 1
-        return kept
 
 
 class LocalFusionGraph(FusionRule):
@@ -249,7 +222,7 @@ class GraphExchange:
         for mask in waiting.values():  # a message's own node is met when it arrives
             for node in self.pedigrees.maximal(mask):
                 kept |= 1 << node
-        kept = self.pedigrees.reachable([*(agent.known for agent in agents), *waiting.values()], kept)
+        kept = reachable(self.pedigrees.below, [*(agent.known for agent in agents), *waiting.values()], kept)
         nodes = [node for node in range(kept.bit_length()) if kept >> node & 1]
         ledger, n = self.estimator.ledger, len(agents)
         values, below, step, moved = self.pedigrees.values, self.pedigrees.below, ledger.step, ledger.moved
