@@ -6,7 +6,7 @@ carried out state by state.  After the exchange at step k − 1 agent i knows wh
 together, and so what agents i ∈ A have in common after it is ∩ ∪_{j∈S_i} (pedigree of j): one of the few elements
 of a distributive lattice on n generators (18 for n = 3) instead of one for each of the 2^(n(n−1)) outcomes.  Then
 
-    Y_A(k) = Σ_{i∈A} local_i(∪S_i) + Σ_{T⊆A, |T|≥2} (−1)^(|T|+1) · common(∩_{i∈T} ∪S_i)
+    Y_A(k) = Σ_{i∈A} HᵢᵀRᵢ⁻¹Hᵢ + Σ_{T⊆A, T≠∅} (−1)^(|T|+1) · [ common(∩_{i∈T} ∪S_i) brought forward to k ]
 
 is summed in floating point, for all states and outcomes at once.  With delays, sensors that may miss, or more agents
 than fit a machine word, the last exchange is carried out instead.
@@ -58,7 +58,7 @@ WRITTEN_OUT = 10**30
 
 
 class FusedSet(NamedTuple):
-    """Outcomes of the last exchanges as a set of agents A sees them: Y = Σ sign · Y[ids[:, index]].
+    """Outcomes of the last exchanges as a set of agents A sees them: Y = Y[always] + Σ sign · Y[ids[:, index]].
 
     Parameters
     ----------
@@ -67,6 +67,7 @@ class FusedSet(NamedTuple):
     starts : first cell of every group of cells with one factor.
     factors : weight of each group's cells, shape (groups, width).
     shares : weight of "the agent fuses just this" for each group of agents, shape (groups of agents, width).
+    always : value that is part of every claim, or None.
     """
 
     ids: np.ndarray
@@ -74,6 +75,7 @@ class FusedSet(NamedTuple):
     starts: np.ndarray
     factors: np.ndarray
     shares: list[Any]
+    always: int | None = None
 
 
 class Ending(NamedTuple):
@@ -362,23 +364,28 @@ def _two_step_ending(
         order = np.argsort(factor_of, kind="stable")
         starts = np.searchsorted(factor_of[order], np.arange(len(factors)))
         heard = {i: h[order] for i, h in heard.items()}
-        terms = [(1, table.local(i, heard[i])) for i in members]
-        for size in range(2, len(members) + 1):
+        terms = []
+        for size in range(1, len(members) + 1 if estimator.removes else 2):
             sign = 1 if size % 2 else -1
             terms += [(sign, table.common([heard[i] for i in T])) for T in combinations(members, size)]
-        views.append((terms, starts, factors, shares))
+        always = estimator.ledger.measurements(step, [estimator.sources[i] for i in members])
+        views.append((tuple(terms), starts, factors, shares, always))
     ids, progress, states = [], listener(), list(layer)
     for first in range(0, len(states), TOGETHER):
         some = states[first : first + TOGETHER]
-        exchanges = estimator.together(some)
-        if exchanges is not None:
-            ids.append(table.values_of(exchanges))
-        else:
-            ids.append(np.array([table.values(estimator.exchange(state)) for state in some]))
+        ids.append(table.values(some))
         progress.advance(f"steps {step - 1} and {step}", first + len(some), len(states))
-    ids = np.concatenate(ids)
-    made = [FusedSet(ids, tuple((s, i) for s, i in terms if i is not None), *rest) for terms, *rest in views]
-    return Ending(step, weights.table(list(layer.values()), degree), made, events)
+    ids, state_weights = _rows_once(np.concatenate(ids), weights.table(list(layer.values()), degree))
+    return Ending(step, state_weights, [FusedSet(ids, *view) for view in views], events)
+
+
+def _rows_once(ids: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """States of which everything is equal that is still asked for as one, with their weights added up."""
+    random = np.random.default_rng(3).integers(1 << 64, size=(2, ids.shape[1]), dtype=np.uint64)
+    which, one = numbered(random @ ids.T.view(np.uint64))
+    total = np.zeros((len(one), weights.shape[1]))
+    np.add.at(total, which, weights)
+    return ids[one], total
 
 
 def _members(agents: int, n: int) -> list[int]:
@@ -422,14 +429,12 @@ def _cells(
 
 
 class _LastViews:
-    """Numbers the local estimates and the common pedigrees that the views of a step need."""
+    """Numbers the common pedigrees that the views of a step need; what one agent knows is common to it alone."""
 
     def __init__(self, estimator: AdditiveEstimator, agents: int) -> None:
         self.estimator = estimator
-        self._locals: dict[tuple[int, int], int] = {}
         self._common: dict[int, int] = {}
         self._clauses: list[tuple[int, ...]] = []
-        self._removes = estimator.removes
         points = np.arange(1 << agents, dtype=np.uint64)
         variables = [sum((1 << int(p)) for p in points if int(p) >> i & 1) for i in range(agents)]
         self._truth = np.zeros(1 << agents, dtype=np.uint64)
@@ -437,52 +442,36 @@ class _LastViews:
             with_i = (points >> np.uint64(i) & np.uint64(1)).astype(bool)
             self._truth[with_i] |= np.uint64(variable)
 
-    def local(self, agent: int, heard: np.ndarray) -> np.ndarray:
-        """Index of the agent's next local estimate after each heard set."""
-        source = self.estimator.sources[agent]
-        found, where = np.unique(heard, return_inverse=True)
-        return np.array([self._locals.setdefault((source, h), len(self._locals)) for h in found.tolist()])[where]
-
-    def common(self, heard: Sequence[np.ndarray]) -> np.ndarray | None:
-        """Index of what agents with those heard sets have in common (counted after the local estimates)."""
-        if not self._removes:
-            return None
+    def common(self, heard: Sequence[np.ndarray]) -> np.ndarray:
+        """Index of what agents with those heard sets have in common."""
         meet = np.bitwise_and.reduce([self._truth[h] for h in heard])
         found, first, where = np.unique(meet, return_index=True, return_inverse=True)
         for table, cell in zip(found.tolist(), first.tolist(), strict=True):
             if table not in self._common:
-                self._common[table] = -2 - len(self._clauses)
+                self._common[table] = len(self._clauses)
                 self._clauses.append(tuple({int(h[cell]) for h in heard}))
         return np.array([self._common[table] for table in found.tolist()])[where]
 
-    def values(self, exchange: Any) -> list[int]:
-        """Values of one state, local estimates first, commons from the end: index −2 − i is common i, −1 nothing."""
-        ledger = self.estimator.ledger
-        locals_ = [ledger.local(exchange.union(heard), source) for source, heard in self._locals]
-        step = ledger.step[locals_[0]]
-        commons = [exchange.common(clauses) for clauses in self._clauses]
-        brought = [-1 if value is None else ledger.forward(value, step) for value in commons]
-        return [*locals_, *reversed(brought), -1]
-
-    def values_of(self, exchanges: Any) -> np.ndarray:
-        """Values of many states, (states, values), as `values` has those of one."""
-        ledger, pairs = self.estimator.ledger, list(self._locals)
-        heard = sorted({h for _, h in pairs})
-        unions = exchanges.unions(heard)
-        fused = dict(zip(heard, unions.T, strict=True))
-        locals_ = [ledger.locals(fused[h], source) for source, h in pairs]
-        commons = ledger.forwards(exchanges.commons(self._clauses), int(ledger.steps[locals_[0][0]]))
-        return np.stack([*locals_, *commons.T[::-1], np.full(len(unions), -1)], axis=1)
+    def values(self, states: Sequence[Any]) -> np.ndarray:
+        """Values for some states, brought forward, (states, values); −1 for nothing."""
+        ledger, together = self.estimator.ledger, self.estimator.together(states)
+        if together is not None:
+            commons = together.commons(self._clauses)
+        else:
+            exchanges: list[Any] = [self.estimator.exchange(state) for state in states]
+            commons = np.array([[exchange.common(clauses) for clauses in self._clauses] for exchange in exchanges])
+        # the union of what all know is never nothing
+        return ledger.forwards(commons, int(ledger.steps[commons.max()]) + 1)
 
 
 @dataclass(frozen=True, eq=False)
 class Claimed:
-    """Different claims of a step, outcomes with equal ones added up: Y = Σ sign · Y[ids].
+    """Different claims of a step, outcomes with equal ones added up: Y = Σ sign · Y[ids], and what all contain.
 
     Parameters
     ----------
-    terms : (sign, values (claims,)); the value −1 stands for nothing.
-    which : number of the claim in every outcome, (states, cells).
+    terms : (sign, values (claims,)), without what is part of all; the value −1 stands for nothing.
+    which : number of the claim in every outcome, (states, cells), or None where each has its own.
     view : the outcomes.
     states : weight of every state, on the weights' axis.
     events : events up to the step.
@@ -490,7 +479,7 @@ class Claimed:
     """
 
     terms: tuple[tuple[int, np.ndarray], ...]
-    which: np.ndarray
+    which: np.ndarray | None
     view: FusedSet
     states: np.ndarray
     events: int
@@ -513,23 +502,25 @@ class Claimed:
 
         total, factor_of = np.zeros((self.number, self.width)), self._factor_of
         for some, pairs in self._pairs():
-            which = self.which[some].ravel()
+            which = self._of(np.arange(self.number)[None], some).ravel()
             pair_of = (np.arange(len(pairs))[:, None] * pairs.shape[1] + factor_of).ravel()
             places = (np.ones(len(which)), (which, pair_of))
             total += csr_array(places, shape=(self.number, pairs[:, :, 0].size)) @ pairs.reshape(-1, self.width)
         return np.ascontiguousarray(total.T)
 
     def expected(self, values: np.ndarray) -> np.ndarray:
-        """Σ weight · values (claims, numbers) for every group of agents, (groups, full width, numbers).
+        """Σ weight · values (numbers, claims) for every group of agents, (groups, full width, numbers).
 
         Without the weight of any claim: for few numbers of many claims.
         """
-        found, columns = np.zeros((self.width, values.shape[1])), np.ascontiguousarray(values.T)
-        of_factor = np.eye(len(self.view.factors))[self._factor_of]
-        for some, pairs in self._pairs():
-            by_factor = columns.take(self.which[some], axis=1) @ of_factor
-            found += np.tensordot(pairs, by_factor, axes=((0, 1), (1, 2)))
-        return self.shared(found)
+        factors, size = self.view.factors, max(1, LISTED // (self._cells * len(values)))
+        found = np.zeros((self.states.shape[1], len(values), len(factors)))
+        for first in range(0, len(self.states), size):
+            some = slice(first, first + size)
+            by_factor = np.add.reduceat(self._of(values, some), self.view.starts, axis=2)
+            found += np.tensordot(self.states[some], by_factor, axes=((0,), (1,)))
+        weighed = [self.bookkeeping.weighed(found[..., f], factor) for f, factor in enumerate(factors)]
+        return self.shared(np.sum(weighed, axis=0))
 
     def shared(self, found: np.ndarray) -> np.ndarray:
         """What is known before the last exchange counts, (width, ...), after it: (groups, full width, ...)."""
@@ -541,13 +532,23 @@ class Claimed:
         return np.stack([np.zeros(shape) if part is None else part for part in by_group])
 
     @property
+    def _cells(self) -> int:
+        return len(self.view.terms[0][1])
+
+    def _of(self, values: np.ndarray, some: slice) -> np.ndarray:
+        """Values (numbers, claims) of what is claimed in some states, (numbers, states, cells)."""
+        if self.which is None:
+            return values.reshape(len(values), -1, self._cells)[:, some]
+        return values.take(self.which[some], axis=1)
+
+    @property
     def _factor_of(self) -> np.ndarray:
-        return np.repeat(np.arange(len(self.view.factors)), np.diff([*self.view.starts, self.which.shape[1]]))
+        return np.repeat(np.arange(len(self.view.factors)), np.diff([*self.view.starts, self._cells]))
 
     def _pairs(self) -> Iterator[tuple[slice, np.ndarray]]:
         """Weights of some states with every factor, (states, factors, width), at a time."""
-        size = max(1, LISTED // max(self.which.shape[1], len(self.view.factors) * self.width))
-        for first in range(0, len(self.which), size):
+        size = max(1, LISTED // max(self._cells, len(self.view.factors) * self.width))
+        for first in range(0, len(self.states), size):
             some = slice(first, first + size)
             yield some, self.bookkeeping.pairs(self.states[some], self.view.factors)
 
@@ -567,12 +568,13 @@ def claims_of(ending: Ending, signatures: np.ndarray | None, weights: Weights) -
         alike = len(different_ones) < WORTH * cells * len(view.ids[tried])
         for first in range(0, len(view.ids), size):
             states = slice(first, first + size)
-            ids, order, which = view.ids[states], np.arange(len(view.ids[states]) * cells), None
+            ids, which = view.ids[states], None
             if alike:
                 which, order = numbered(_keys(view, states, signatures))
-            row, cell = np.divmod(order, cells)
-            terms = tuple((sign, ids[row, index[cell]]) for sign, index in view.terms)
-            which = (order if which is None else which).astype(np.int32).reshape(-1, cells)
+                which, (row, cell) = which.astype(np.int32).reshape(-1, cells), np.divmod(order, cells)
+                terms = tuple((sign, ids[row, index[cell]]) for sign, index in view.terms)
+            else:
+                terms = tuple((sign, ids.take(index, axis=1).ravel()) for sign, index in view.terms)
             yield Claimed(terms, which, view, ending.weights[states], ending.events, weights)
 
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import permutations
 from math import prod
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -297,9 +298,19 @@ class _Polynomial(_Memoryless):
 
 @dataclass(frozen=True)
 class CountWeights(_Polynomial):
-    """Weights by number of successes, equal µ: outcomes counted exactly, packed into one integer, `bits` apiece."""
+    """Weights by number of successes, equal µ: outcomes counted exactly, packed into one integer.
 
-    bits: int
+    Parameters
+    ----------
+    events : largest number of events.
+    """
+
+    events: int
+
+    @cached_property
+    def bits(self) -> int:
+        """Bits of each count, whole bytes."""
+        return 8 * (self.events // 8 + 1)
 
     def one(self) -> int:
         """Weight of the start."""
@@ -327,12 +338,11 @@ class CountWeights(_Polynomial):
 
     def table(self, weights: Sequence[Any], degree: int) -> np.ndarray:
         """Numbers of outcomes by number of successes, shape (weights, degree + 1)."""
-        return np.array(self.exactly(weights, degree), dtype=float)
-
-    def exactly(self, weights: Sequence[Any], degree: int) -> list[list[int]]:
-        """Return the same as integers."""
-        mask = (1 << self.bits) - 1
-        return [[w >> c * self.bits & mask for c in range(degree + 1)] for w in weights]
+        size = self.bits // 8
+        packed = b"".join([w.to_bytes(size * (degree + 1), "little") for w in weights])
+        digits = np.frombuffer(packed, np.uint8).reshape(len(weights), degree + 1, size)
+        used = 1 + np.flatnonzero(digits.any(axis=(0, 1))).max()
+        return digits[..., :used] @ np.array([256.0**place for place in range(used)])
 
     def factors(self, factors: Sequence[Any], degree: int) -> np.ndarray:
         """Outcomes' factors as coefficients, shape (factors, degree + 1)."""
@@ -491,7 +501,7 @@ def weights_for(network: Network, number_of_events: int, certain: bool = True) -
     ----------
     certain : whether sensors never miss.
     """
-    return CountWeights(number_of_events + 1) if certain and network.delay == (1.0,) else Coefficients()
+    return CountWeights(number_of_events) if certain and network.delay == (1.0,) else Coefficients()
 
 
 def bernstein(coefficients: np.ndarray, degree: int, link: np.ndarray) -> np.ndarray:

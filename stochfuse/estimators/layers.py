@@ -14,13 +14,13 @@ messages under way, more nodes than a word has bits.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
 
-from stochfuse.estimators.ledger import Ledger, numbered
+from stochfuse.estimators.ledger import Ledger, hashes, mapped, numbered
 from stochfuse.estimators.protocol import FusionRule
 
 MOST_NODES, MOST_STATES = 48, 1 << 14
@@ -30,7 +30,7 @@ MOST_AGENTS, MOST_STEPS = 7, 1 << 8
 ROUNDS = 2
 """Times that nodes with equal keys are told by their kin, and by the kin of these."""
 _LAST = np.iinfo(np.int64).max
-_RANDOM = np.random.default_rng(7).integers(1 << 64, size=(2, 4, 64), dtype=np.uint64) | np.uint64(1)
+_RANDOM = np.random.default_rng(7).integers(1 << 64, size=(2, 4), dtype=np.uint64) | np.uint64(1)
 
 
 class HeldEstimate(NamedTuple):
@@ -92,14 +92,12 @@ class GraphLayer:
         small = len(states) <= MOST_STATES and most <= MOST_NODES and agents <= MOST_AGENTS and step < MOST_STEPS
         return small and not any(state.late for state in states)
 
-    def unions(self, heard: Sequence[int]) -> np.ndarray:
-        """Values of what some sets of agents know together, (states, sets)."""
-        return self._fuse(self._masks(heard))
-
     def commons(self, clauses: Sequence[Sequence[int]]) -> np.ndarray:
         """Values of what agents that heard some sets have in common, (states, sets of sets); −1 where it is nothing."""
-        masks = [np.bitwise_and.reduce(self._masks(heard), axis=1) for heard in clauses]
-        return self._fuse(np.stack(masks, axis=1)) if masks else np.zeros((len(self.states), 0), dtype=np.int64)
+        sets = sorted({heard for clause in clauses for heard in clause})
+        masks = dict(zip(sets, self._masks(sets).T, strict=True))
+        common = [np.bitwise_and.reduce([masks[heard] for heard in clause]) for clause in clauses]
+        return self._fuse(np.stack(common, axis=1))
 
     def after(self, heard: np.ndarray) -> tuple[np.ndarray, list[GraphState]]:
         """States before the next exchange, and which one follows on each state and outcome, (states, outcomes).
@@ -110,8 +108,8 @@ class GraphLayer:
         """
         sets, index = np.unique(heard, return_inverse=True)
         index = index.reshape(heard.shape)
-        masks, unions = self._masks(sets.tolist()), self.unions(sets.tolist())
-        values = _locals(self.estimator, unions, index)
+        masks = self._masks(sets.tolist())
+        values = _locals(self.estimator, self._fuse(masks), index)
         of = np.repeat(np.arange(len(self.states)), len(heard))
         known = masks[:, index].reshape(-1, self.agents)
         which, states = _Merging(self, of, known, values).merged()
@@ -181,13 +179,16 @@ class _Merging:
         ledger, n = layer.estimator.ledger, layer.agents
         self.ledger, self.values = ledger, values
         self.permutations = np.array(layer.estimator.relabellings)
-        kept = _reachable(known, layer.below[of])
+        below = layer.below[of]
+        same, one = numbered(hashes(np.concatenate([np.sort(known, axis=1), below], axis=1)))
+        structures = zip(below[one].tolist(), known[one].tolist(), strict=True)
+        kept = np.array([reachable(*structure) for structure in structures])[same]
         bits = np.arange(layer.below.shape[1])
         self.known, self.kept = known & kept[:, None], kept[:, None] >> bits & 1 == 1
-        self.nodes, self.below = layer.values[of], (layer.below[of] & kept[:, None]) * self.kept
+        self.nodes, self.below = layer.values[of], (below & kept[:, None]) * self.kept
         # ancestors first: an earlier step, or fewer ancestors within one
         rank = ledger.steps[self.nodes] << 6 | np.bitwise_count(self.below).astype(np.int64)
-        self.rank = (rank << 32 | _mapped(self.nodes, ledger.invariant)) << n
+        self.rank = (rank << 32 | _invariants(ledger, self.nodes)) << n
         self.holders = self.known[:, None, :] >> bits[:, None] & 1
         self.most = int(self.kept.sum(axis=1).max())
 
@@ -211,12 +212,12 @@ class _Merging:
         above = above.astype(np.uint64)
         kin = who[same].astype(np.uint64)
         for _ in range(ROUNDS):
-            over = (above * mixed(kin, 0)[:, None, :]).sum(axis=2)
-            kin = mixed(over + (above * mixed(kin, 1)[:, :, None]).sum(axis=1) + mixed(kin, 2), 3)
+            over = np.einsum("spq,sq->sp", above, mixed(kin, 0)) + np.einsum("spq,sp->sq", above, mixed(kin, 1))
+            kin = mixed(over + mixed(kin, 2), 3)
         at[same] = np.lexsort((kin, who[same]))
         for _ in range(ROUNDS):  # what is alike still, by the places that its ancestors have now
             place = np.argsort(at[same], axis=1)
-            by_place = (above * mixed(place, 0)[:, None, :] * (place[:, None, :] != place[:, :, None])).sum(axis=2)
+            by_place = np.einsum("spq,sq->sp", above, mixed(place, 0)) - mixed(place, 0)
             at[same] = np.lexsort((by_place, kin, who[same]))
         return at
 
@@ -224,7 +225,7 @@ class _Merging:
         """Relabellings that put the agents of each item into their least order, (items, relabellings)."""
         tokens = mixed(self.rank + self.holders.sum(axis=-1), 3)
         theirs = (self.holders.astype(np.uint64) * tokens[:, :, None]).sum(axis=1)
-        return _least(mixed(theirs + mixed(_mapped(self.values, self.ledger.invariant), 2), 1), self.permutations)
+        return _least(mixed(theirs + mixed(_invariants(self.ledger, self.values), 2), 1), self.permutations)
 
     def _rows(self, item: np.ndarray, order: np.ndarray, at: np.ndarray) -> list[np.ndarray]:
         """Values and pedigrees of nodes, −1 and 0 beyond the last, and of agents, renamed."""
@@ -244,26 +245,22 @@ class NaiveLayer:
         self.estimator = estimator
         self.values = np.array([state.agents for state in states])
 
-    def unions(self, heard: Sequence[int]) -> np.ndarray:
-        """Values of the sums of some sets of agents, (states, sets)."""
+    def commons(self, clauses: Sequence[Sequence[int]]) -> np.ndarray:
+        """Values of the sums of some sets of agents, (states, sets), each a clause of its own: nothing is common."""
         states, out = np.arange(len(self.values)), []
-        for h in heard:
+        for (h,) in clauses:
             members = [i for i in range(self.values.shape[1]) if h >> i & 1]
             terms, of = self.values[:, members].ravel(), np.repeat(states, len(members))
             ones = np.ones(len(terms), dtype=np.int64)
             out.append(self.estimator.ledger.combined(self.values[:, 0], of, terms, ones) if members[1:] else terms)
         return np.stack(out, axis=1)
 
-    def commons(self, clauses: Sequence[Sequence[int]]) -> np.ndarray:
-        """Nothing is taken for common."""
-        return np.full((len(self.values), len(clauses)), -1)
-
     def after(self, heard: np.ndarray) -> tuple[np.ndarray, list[NaiveState]]:
         """States before the next exchange, and which one follows on each state and outcome; see `GraphLayer`."""
         ledger, permutations = self.estimator.ledger, np.array(self.estimator.relabellings)
         sets, index = np.unique(heard, return_inverse=True)
-        values = _locals(self.estimator, self.unions(sets.tolist()), index.reshape(heard.shape))
-        item, order = np.nonzero(_least(mixed(_mapped(values, ledger.invariant), 1), permutations))
+        values = _locals(self.estimator, self.commons(sets[:, None].tolist()), index.reshape(heard.shape))
+        item, order = np.nonzero(_least(mixed(_invariants(ledger, values), 1), permutations))
         agents = np.take_along_axis(values[item], permutations[order], axis=1)
         agents = _moved(ledger, agents, order, permutations)
         which, first = _one_of_each(item, [agents])
@@ -297,8 +294,12 @@ def _moved(ledger: Ledger, values: np.ndarray, order: np.ndarray, permutations: 
     out = np.empty_like(values)
     for number in np.unique(order).tolist():
         here, permutation = np.flatnonzero(order == number), tuple(permutations[number].tolist())
-        out[here] = _mapped(values[here], lambda value: ledger.moved(value, permutation))  # noqa: B023
+        out[here] = mapped(values[here], lambda some: [ledger.moved(value, permutation) for value in some])  # noqa: B023
     return out
+
+
+def _invariants(ledger: Ledger, values: np.ndarray) -> np.ndarray:
+    return mapped(values, lambda some: [ledger.invariant(value) for value in some])
 
 
 def _one_of_each(item: np.ndarray, rows: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -306,7 +307,7 @@ def _one_of_each(item: np.ndarray, rows: Sequence[np.ndarray]) -> tuple[np.ndarr
 
     Of several rows of an item, which are next to each other, one that all items of a kind agree upon.
     """
-    keys = _hashes(rows)
+    keys = hashes(np.concatenate(rows, axis=1))
     first = np.lexsort((keys[0], item))
     first = first[np.flatnonzero(np.diff(item[first], prepend=-1))]
     which, one = numbered(keys[:, first])
@@ -322,37 +323,33 @@ def _states(rows: Sequence[np.ndarray]) -> list[GraphState]:
     ]
 
 
-def _reachable(known: np.ndarray, below: np.ndarray) -> np.ndarray:
-    """Nodes that a later search can meet, as masks; see `Pedigrees.reachable`."""
-    which, one = numbered(_hashes([known, below]))
-    known, below = known[one], below[one]
-    kept, done = np.zeros(len(known), dtype=np.int64), np.zeros(len(known), dtype=np.int64)
+def reachable(below: Sequence[int], known: Sequence[int], kept: int = 0) -> int:
+    """Nodes that a later search can meet: given ones, and the maximal ones of any two pedigrees' intersection.
 
-    def meet(some: np.ndarray, shared: np.ndarray) -> None:
-        while len(some):
-            here = shared != 0
-            some, shared = some[here], shared[here]
-            top = highest(shared)
-            kept[some] |= 1 << top
-            shared = shared & ~below[some, top]
-
-    everyone = np.arange(len(known))
-    for i in range(known.shape[1]):
-        for j in range(i):
-            meet(everyone, known[:, i] & known[:, j])
-    while (kept & ~done).any():
-        for node in range(below.shape[1]):
-            here = np.flatnonzero((kept & ~done) >> node & 1)
-            own = below[here, node]
-            others = [known[here, i] for i in range(known.shape[1])]
-            others += [below[here, other] * (done[here] >> other & 1) for other in range(below.shape[1])]
-            for other in others if len(here) else ():
-                shared = own & other
-                # what one of the two holds wholly has that one for its latest node
-                new = np.flatnonzero((shared != own) & (shared != other))
-                meet(here[new], shared[new])
-            done[here] |= 1 << node
-    return kept[which]
+    Parameters
+    ----------
+    below : pedigree of each node.
+    known : pedigrees that a search can begin with.
+    kept : nodes that it can meet whatever else it does.
+    """
+    done: set[int] = set()
+    members = [*known, *(below[n] for n in range(kept.bit_length()) if kept >> n & 1)]
+    i = 1
+    while i < len(members):
+        mask = members[i]
+        for other in members[:i]:
+            shared = mask & other
+            if shared in done:
+                continue
+            done.add(shared)
+            while shared:
+                top = shared.bit_length() - 1
+                if not kept >> top & 1:
+                    kept |= 1 << top
+                    members.append(below[top])
+                shared &= ~below[top]
+        i += 1
+    return kept
 
 
 def _renumbered(masks: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -361,12 +358,6 @@ def _renumbered(masks: np.ndarray, at: np.ndarray) -> np.ndarray:
     for place in range(at.shape[1]):
         out |= (masks >> at[:, place, None] & 1) << place
     return out
-
-
-def _mapped(values: np.ndarray, function: Callable[[int], int]) -> np.ndarray:
-    """Return what a function makes of values that are not negative, each asked for once."""
-    found, which = np.unique(values, return_inverse=True)
-    return np.array([value if value < 0 else function(value) for value in found.tolist()])[which].reshape(values.shape)
 
 
 def _flat(pairs: Sequence[Sequence[tuple[int, int]]]) -> np.ndarray:
@@ -381,17 +372,7 @@ def highest(masks: np.ndarray) -> np.ndarray:
 
 def mixed(numbers: np.ndarray, way: int) -> np.ndarray:
     """Whole numbers scattered over 64 bits, in one of some ways."""
-    out = numbers.astype(np.uint64) * _RANDOM[0, way, 0]
+    out = numbers.astype(np.uint64) * _RANDOM[0, way]
     out ^= out >> np.uint64(32)
-    out *= _RANDOM[1, way, 0]
+    out *= _RANDOM[1, way]
     return out ^ out >> np.uint64(29)
-
-
-def _hashes(parts: Sequence[np.ndarray]) -> np.ndarray:
-    """Two numbers of 64 bits for every row of some arrays, (2, rows)."""
-    out = np.zeros((2, len(parts[0])), dtype=np.uint64)
-    for part, random in zip(parts, np.moveaxis(_RANDOM, 1, 0), strict=False):
-        for column, factors in zip(part.T, random.T, strict=False):
-            for way, factor in enumerate(factors):
-                out[way] += mixed((column.astype(np.uint64) + np.uint64(1)) * factor, way)
-    return out

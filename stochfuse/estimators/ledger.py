@@ -17,6 +17,7 @@ Values under numbers, when agents of one kind change places: what ledgers of sum
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from itertools import chain, pairwise, repeat
 from typing import Any
@@ -44,6 +45,7 @@ MANY = 1 << 14
 """Terms from which on sums are added up by a sparse product, several times faster."""
 COMMON = -1
 """Source of an initial estimate that all agents share."""
+_RANDOM = np.random.default_rng(5).integers(1 << 64, size=(2, 2, 1 << 13), dtype=np.uint64) | np.uint64(1)
 
 
 class Renamed:
@@ -102,7 +104,6 @@ class Ledger(Renamed):
         self.sums: list[Atoms] = []
         self._atom_of: dict[tuple[str, int, int], int] = {}
         self._value_of: dict[tuple[int, Atoms], int] = {}
-        self._prior_of: dict[int, int] = {}
         self._local_of: dict[tuple[int, int | None], int] = {}
         self._random, self._steps = np.random.default_rng(0), np.zeros(0, dtype=np.int64)
         self._pairs, self._ends = np.zeros((0, 2), dtype=np.int64), np.zeros(1, dtype=np.int64)
@@ -133,14 +134,14 @@ class Ledger(Renamed):
             atoms[atom] = atoms.get(atom, 0) + 1
         return self._value(step, tuple(sorted(atoms.items())))
 
+    def measurements(self, step: int, sources: Sequence[int]) -> int:
+        """Information of some sources' measurements at a step, and nothing else."""
+        return self._value(step, tuple(sorted(Counter(self._atom(MEASURED, step, of) for of in sources).items())))
+
     def forward(self, value: int, step: int) -> int:
         """Return the value brought forward to a later step by the time update (24)."""
         while self.step[value] < step:
-            known = self._prior_of.get(value)
-            if known is None:
-                later = self.step[value] + 1
-                known = self._prior_of[value] = self._value(later, ((self._atom(PRIOR, later, value), 1),))
-            value = known
+            value = self.local(value, None)
         return value
 
     def combine(self, step: int, terms: Iterable[tuple[int, int]]) -> int:
@@ -165,14 +166,12 @@ class Ledger(Renamed):
         brought = self._forwarded(values, step[of])
         starts = np.searchsorted(of, np.arange(len(like)))
         signed = times.view(np.uint64)[:, None] * self.signatures()[brought]
-        order, first = different(np.ascontiguousarray(np.add.reduceat(signed, starts, axis=0).T))
+        which, first = numbered(np.ascontiguousarray(np.add.reduceat(signed, starts, axis=0).T))
         number = np.full(len(like), -1)
-        number[order[first]] = np.arange(len(first))
+        number[first] = np.arange(len(first))
         one = np.flatnonzero(number[of] >= 0)
         sums = self._added_up(number[of[one]], brought[one], times[one], len(first))
-        out = np.empty(len(like), dtype=np.int64)
-        out[order] = np.repeat(self._values(step[order[first]].tolist(), sums), np.diff([*first, len(order)]))
-        return out
+        return np.array(self._values(step[first].tolist(), sums))[which]
 
     def _added_up(self, of: np.ndarray, values: np.ndarray, times: np.ndarray, sums: int) -> list[Atoms]:
         """Return so many sums, Σ times · value over the terms of each."""
@@ -190,21 +189,28 @@ class Ledger(Renamed):
 
     def locals(self, values: np.ndarray, source: int | None) -> np.ndarray:
         """Return many local estimates at a time, see `local`."""
-        found, which = np.unique(values, return_inverse=True)
-        asked = [(value, source) for value in found.tolist()]
-        new = [value for value, _ in asked if (value, source) not in self._local_of]
-        if new:
-            step = self.step[new[0]] + 1
-            measured = () if source is None else ((self._atom(MEASURED, step, source), 1),)
-            sums = [tuple(sorted((*measured, (self._atom(PRIOR, step, value), 1)))) for value in new]
-            self._local_of.update(zip(zip(new, repeat(source)), self._values(repeat(step), sums), strict=False))
-        return np.array([self._local_of[pair] for pair in asked])[which].reshape(values.shape)
+
+        def known(different: list[int]) -> list[int]:
+            asked = list(zip(different, repeat(source)))
+            new = [pair for pair in asked if pair not in self._local_of]
+            if new:
+                step = self.step[new[0][0]] + 1
+                measured = () if source is None else ((self._atom(MEASURED, step, source), 1),)
+                priors = [(PRIOR, step, value) for value, _ in new]
+                self.atoms += _added(priors, self._atom_of)
+                sums = [tuple(sorted((*measured, (self._atom_of[prior], 1)))) for prior in priors]
+                self._local_of.update(zip(new, self._values(repeat(step), sums), strict=True))
+            return [self._local_of[pair] for pair in asked]
+
+        return mapped(values, known)
 
     def forwards(self, values: np.ndarray, step: int) -> np.ndarray:
         """Return many values brought forward, see `forward`; −1 stays."""
-        found, which = np.unique(values, return_inverse=True)
-        new = [value if value < 0 else self.forward(value, step) for value in found.tolist()]
-        return np.array(new)[which].reshape(values.shape)
+        out = values.copy()
+        since = np.where(values < 0, step, self.steps[values])
+        for now in range(int(since.min(initial=step)), step):
+            out[since <= now] = self.locals(out[since <= now], None)
+        return out
 
     def _forwarded(self, values: np.ndarray, steps: np.ndarray) -> np.ndarray:
         out = values.copy()
@@ -274,8 +280,7 @@ class Ledger(Renamed):
     def _values(self, steps: Iterable[int], sums: Sequence[Atoms]) -> list[int]:
         """Return the numbers of different sums, of a step each."""
         keys = list(zip(steps, sums, strict=False))
-        new = [key for key in keys if key not in self._value_of]
-        self._value_of.update(zip(new, range(len(self.sums), len(self.sums) + len(new)), strict=True))
+        new = _added(keys, self._value_of)
         self.step += [step for step, _ in new]
         self.sums += [atoms for _, atoms in new]
         return [self._value_of[key] for key in keys]
@@ -290,6 +295,21 @@ class Ledger(Renamed):
         return known
 
 
+def _added(keys: Sequence[Any], numbers: dict[Any, int]) -> list[Any]:
+    """Return those of some different keys that have no number yet, after giving them the next ones."""
+    new = [key for key in keys if key not in numbers]
+    numbers.update(zip(new, range(len(numbers), len(numbers) + len(new)), strict=True))
+    return new
+
+
+def mapped(values: np.ndarray, function: Callable[[list[int]], list[int]]) -> np.ndarray:
+    """Return what a function makes of the different ones of some values; −1 stays."""
+    found = np.flatnonzero(np.bincount(values.ravel() + 1, minlength=1)[1:])
+    table = np.full(found.max(initial=-1) + 2, -1)
+    table[found] = function(found.tolist())
+    return table[values]
+
+
 def different(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Order of keys, of 1 or 2 numbers (numbers, keys), and where the different ones begin in it."""
     order = np.argsort(keys[0])
@@ -302,12 +322,28 @@ def different(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return order, np.flatnonzero(np.concatenate([[True], new]))
 
 
+def hashes(words: np.ndarray, numbers: int = 2) -> np.ndarray:
+    """Return 1 or 2 numbers of 64 bits for every row of up to 2^13 words, (numbers, rows)."""
+    words = words.view(np.uint64)
+    out = np.empty((numbers, len(words)), dtype=np.uint64)
+    for total, (one, other) in zip(out, _RANDOM, strict=False):
+        mixed = words * one[: words.shape[1]]
+        mixed ^= mixed >> np.uint64(32)
+        np.einsum("ij,j->i", mixed, other[: words.shape[1]], out=total)
+        total ^= total >> np.uint64(32)
+        total *= other[-1]
+    return out
+
+
 def numbered(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Number of every key among the different ones, and where one of each of these is; see `different`."""
+    """Number of every key among the different ones, and where one of each of these is, in order; see `different`."""
     order, starts = different(keys)
-    which = np.empty(len(order), dtype=np.int64)
-    which[order] = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(order)))
-    return which, order[starts]
+    which, number = np.empty((2, len(order)), dtype=np.int64)
+    # what is used together stays together in memory
+    one = np.sort(order[starts])
+    number[one] = np.arange(len(one))
+    which[order] = np.repeat(number[order[starts]], np.diff(starts, append=len(order)))
+    return which, one
 
 
 class Sources:
@@ -446,8 +482,8 @@ class InformationClaims:
 
     def __init__(self, information: Information) -> None:
         d = information.Y.shape[-1]
-        # beside each other they would be copied whenever some are added up
-        y, Y = (None if part is None else np.ascontiguousarray(part) for part in information)
+        # beside each other they would be copied whenever some are added up; at −1 stands nothing
+        y, Y = (None if part is None else np.concatenate([part, 0.0 * part[:1]]) for part in information)
         self.information = Information(y, Y)
         items = information.Y[0].size // d**2
         self.width = items * d * max(d, 0 if y is None else y.shape[-1])
@@ -460,16 +496,17 @@ class InformationClaims:
         NoAnswerError
             If some sum is no positive-definite information.
         """
-        which = np.stack([values.ravel() for _, values in terms], axis=1)
-        signs = np.where(which < 0, 0.0, [sign for sign, _ in terms]).ravel()
-        ends = np.arange(0, which.size + 1, len(terms))
-        parts = [part for part in self.information if part is not None]
-        found = [
-            part.reshape(*terms[0][1].shape, *part.shape[1:])
-            for part in _summed(parts, signs, np.maximum(which, 0).ravel(), ends)
-        ]
-        estimate, magnified = estimated(Information(None if len(found) == 1 else found[0], found[-1]), step)
+        found = [None if part is None else self._total(part, terms) for part in self.information]
+        estimate, magnified = estimated(Information(*found), step)
         return estimate, magnified.max(axis=(0, -1))
+
+    @staticmethod
+    def _total(part: np.ndarray, terms: Sequence[tuple[int, np.ndarray]]) -> np.ndarray:
+        (sign, first), *others = terms
+        total = sign * part.take(first, axis=0)
+        for sign, values in others:
+            (np.add if sign > 0 else np.subtract)(total, part.take(values, axis=0), out=total)
+        return total
 
 
 def _summed(parts: Sequence[np.ndarray], times: np.ndarray, which: np.ndarray, ends: np.ndarray) -> list[np.ndarray]:

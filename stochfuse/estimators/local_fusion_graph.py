@@ -30,7 +30,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from stochfuse.errors import TooManyError
-from stochfuse.estimators.layers import GraphLayer, GraphState, HeldEstimate
+from stochfuse.estimators.layers import GraphLayer, GraphState, HeldEstimate, reachable
 from stochfuse.estimators.ledger import COMMON, Ledger
 from stochfuse.estimators.protocol import AdditiveLayer, FusionRule, Late, best_relabelling
 
@@ -99,33 +99,6 @@ class Pedigrees:
         """Remember what a pedigree is worth, so that no search goes below it."""
         self._known[mask] = value
 
-    def reachable(self, known: Sequence[int], kept: int = 0) -> int:
-        """Nodes that a later search can meet: given ones, and the maximal ones of any two pedigrees' intersection.
-
-        Parameters
-        ----------
-        known : pedigrees that a search can begin with.
-        kept : nodes that it can meet whatever else it does.
-        """
-        below, done = self.below, set()
-        members = [*known, *(below[n] for n in range(kept.bit_length()) if kept >> n & 1)]
-        i = 1
-        while i < len(members):
-            mask = members[i]
-            for other in members[:i]:
-                shared = mask & other
-                if shared in done:
-                    continue
-                done.add(shared)
-                while shared:
-                    top = shared.bit_length() - 1
-                    if not kept >> top & 1:
-                        kept |= 1 << top
-                        members.append(below[top])
-                    shared &= ~below[top]
-            i += 1
-        return kept
-
 
 class LocalFusionGraph(FusionRule):
     """The estimator; parameters are those of `FusionRule`."""
@@ -187,16 +160,12 @@ class GraphExchange:
             if left == 0:
                 self._due[receiver] |= mask
 
-    def union(self, heard: int) -> int:
-        """Value of what the agents heard know together."""
-        return self.pedigrees.fuse(self.mask(heard))
-
-    def common(self, clauses: Sequence[int]) -> int | None:
-        """Value of what agents that heard those sets have in common, None if nothing."""
+    def common(self, clauses: Sequence[int]) -> int:
+        """Value of what agents that heard those sets have in common, −1 if nothing."""
         mask = -1
         for heard in clauses:
             mask &= self.mask(heard)
-        return self.pedigrees.fuse(mask) if mask else None
+        return self.pedigrees.fuse(mask) if mask else -1
 
     def fused(self, agent: int, heard: Sequence[int]) -> int:
         """Value that an agent claims after hearing some agents, with what else is due."""
@@ -253,7 +222,7 @@ class GraphExchange:
         for mask in waiting.values():  # a message's own node is met when it arrives
             for node in self.pedigrees.maximal(mask):
                 kept |= 1 << node
-        kept = self.pedigrees.reachable([*(agent.known for agent in agents), *waiting.values()], kept)
+        kept = reachable(self.pedigrees.below, [*(agent.known for agent in agents), *waiting.values()], kept)
         nodes = [node for node in range(kept.bit_length()) if kept >> node & 1]
         ledger, n = self.estimator.ledger, len(agents)
         values, below, step, moved = self.pedigrees.values, self.pedigrees.below, ledger.step, ledger.moved

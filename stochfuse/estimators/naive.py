@@ -63,9 +63,10 @@ class NaiveExchange:
             known = self._fused[heard] = self.estimator.ledger.combine(self._step, terms)
         return known
 
-    def common(self, clauses: Sequence[int]) -> int | None:
-        """Nothing is taken for common."""
-        return None
+    def common(self, clauses: Sequence[int]) -> int:
+        """Value of what an agent that heard a set has, the only clause: nothing else is taken for common."""
+        (heard,) = clauses
+        return self.union(heard)
 
     def fused(self, agent: int, heard: Sequence[int]) -> int:
         """Value that an agent claims after hearing some agents, with what else is due."""

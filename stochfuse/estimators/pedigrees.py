@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.errors import TooManyError
-from stochfuse.estimators.ledger import COMMON, Sources, brought_forward, estimated, numbered, packed, unpacked
+from stochfuse.estimators.ledger import COMMON, Sources, brought_forward, estimated, hashes, numbered, packed, unpacked
 from stochfuse.estimators.protocol import StepOutcomes
 from stochfuse.estimators.together import measured_too
 from stochfuse.kalman.kernel import Estimate
@@ -38,7 +38,7 @@ AT_A_TIME = 1 << 22
 MOST_ROWS = 1 << 30
 """Bytes of intersections beyond which, gone through several times, a machine has too little memory."""
 
-_RANDOM = np.random.default_rng(5).integers(1 << 64, size=(3, 1 << 13), dtype=np.uint64) | np.uint64(1)
+_RUN, _MIX = np.random.default_rng(5).integers(1 << 64, size=2, dtype=np.uint64) | np.uint64(1)
 
 
 class _Sums(NamedTuple):
@@ -254,7 +254,7 @@ class GraphTogether:
 
     def _keys(self, rows: np.ndarray, run: np.ndarray) -> np.ndarray:
         """Tell rows apart, and those of different runs."""
-        return (_hashes(rows) ^ (run.astype(np.uint64) * _RANDOM[2, 0])) * _RANDOM[2, 1]
+        return (hashes(_words(rows), 1)[0] ^ (run.astype(np.uint64) * _RUN)) * _MIX
 
     def _placed(self, levels: np.ndarray, keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Places of the values of different sets, by level and key in order; and which of them are new."""
@@ -320,15 +320,3 @@ def _sizes(rows: np.ndarray) -> np.ndarray:
 def _words(rows: np.ndarray) -> np.ndarray:
     """Rows of latest steps in words of 64 bits, that move and compare faster."""
     return np.ascontiguousarray(rows).view(np.uint64)
-
-
-def _hashes(rows: np.ndarray) -> np.ndarray:
-    """One number of 64 bits for every row."""
-    words = _words(rows)
-    one, other = _RANDOM[:2, : words.shape[1]]
-    mixed = words * one
-    mixed ^= mixed >> np.uint64(32)
-    total = np.einsum("ij,j->i", mixed, other)
-    total ^= total >> np.uint64(32)
-    total *= _RANDOM[2, 2]
-    return total

@@ -100,12 +100,11 @@ class AdditiveEstimator(Estimator, Protocol):
 class AdditiveLayer(Protocol):
     """The exchanges of many states of an additive estimator, with nothing under way."""
 
-    def unions(self, heard: Sequence[int]) -> np.ndarray:
-        """Values of what would be fused from some sets of agents, (states, sets)."""
-        ...
-
     def commons(self, clauses: Sequence[Sequence[int]]) -> np.ndarray:
-        """Values of what agents that heard some sets have in common, (states, sets of sets); −1 where it is nothing."""
+        """Values of what agents that heard some sets have in common, (states, sets of sets); −1 where it is nothing.
+
+        One set alone: what would be fused from it.
+        """
         ...
 
     def after(self, heard: np.ndarray) -> tuple[np.ndarray, list[Any]]:
@@ -129,8 +128,11 @@ class Claims(Protocol):
     width: int
 
     def estimate(self, terms: Sequence[tuple[int, np.ndarray]], step: int) -> tuple[Any, Any]:
-        """Estimates of a step, Σ sign · value over (sign, values of any one shape), and by how much rounding grew, one
-        number or one for each item of a batch.
+        """Estimates of a step, and by how much rounding grew, one number or one for each item of a batch.
+
+        Parameters
+        ----------
+        terms : sign and values, of any one shape or, but for the first, a value for all: Σ sign · value is claimed.
 
         An `Estimate` of P (..., d, d) and x (..., d, columns), which holds data or a noise footprint or is None; or the
         `Moments` of the error themselves.

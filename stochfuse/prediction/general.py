@@ -58,7 +58,7 @@ KEPT = 8
 """Structures kept for what is asked next."""
 HELD = 1 << 24
 """Weights of claims that are held, and not found again when they are needed again."""
-CHUNK = 1 << 21
+CHUNK = 1 << 17
 """Numbers of estimates that are worked on at a time."""
 BLOCK = 1 << 20
 """Numbers that the values of a block of items take."""
@@ -117,7 +117,7 @@ class Enumerated:
             held, numbers = [], 0
             for block in found:
                 held.append(block)
-                numbers += block.which.size // 2 + block.number * block.width
+                numbers += (0 if block.which is None else block.which.size // 2) + block.number * block.width
                 if numbers > HELD:
                     return _rest(held, found)
             self._held[step] = held
@@ -137,7 +137,10 @@ def in_numbers(block: Claimed, values: Claims, step: int) -> Iterator[tuple[slic
     size = max(1, CHUNK // values.width)
     for first in range(0, block.number, size):
         some = slice(first, first + size)
-        yield some, *values.estimate([(sign, ids[some]) for sign, ids in block.terms], step)
+        terms = [(sign, ids[some]) for sign, ids in block.terms]
+        if block.view.always is not None:
+            terms.append((1, np.array([block.view.always])))
+        yield some, *values.estimate(terms, step)
 
 
 def _rest(held: list[Claimed], found: Iterator[Claimed]) -> Iterator[Claimed]:
@@ -316,7 +319,7 @@ class Outcomes:
     def _kept(self) -> np.ndarray:
         """Probability of the outcomes that were not left out, (rows, steps)."""
         steps = range(1, self.system.steps + 1)
-        by_step = [sum(b.expected(np.ones((b.number, 1)))[0, :, 0] for b in self.found.claims(step)) for step in steps]
+        by_step = [sum(b.expected(np.ones((1, b.number)))[0, :, 0] for b in self.found.claims(step)) for step in steps]
         return np.stack(by_step, axis=1)
 
     def statistic(self, name: str, metric: Metric, groups: Sequence[int], quantity: str = "claimed") -> np.ndarray:
@@ -437,15 +440,14 @@ def _expectation(
         few = []
         for some, estimate, grown in in_numbers(block, values, step):
             magnified, averaged = max(magnified, float(grown)), of(estimate)
-            flat = [part.reshape(len(part), -1) for part in averaged if part is not None]
-            numbers = np.concatenate(flat, axis=1)
+            numbers = np.concatenate([part.reshape(len(part), -1).T for part in averaged if part is not None])
             # the cheaper of the two: numbers of every outcome, or weights of every claim
-            if numbers.shape[1] < block.width:
+            if len(numbers) < block.width:
                 few.append(numbers)
             else:
-                total = _sum(total, block.shared(block.total[:, some] @ numbers))
+                total = _sum(total, block.shared(block.total[:, some] @ numbers.T))
         if few:
-            total = _sum(total, block.expected(np.concatenate(few)))
+            total = _sum(total, block.expected(np.concatenate(few, axis=1)))
     if averaged is None or total is None:
         raise StochfuseError("no outcome is possible")
     return [_unflattened(by_group, averaged) for by_group in total], magnified

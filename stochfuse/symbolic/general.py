@@ -173,7 +173,7 @@ class GeneralForm:
         labels = kinds if self.quantity == CLAIMED else tuple(range(self.agents))
         permutations = relabellings(network, rows, kinds)
         drawn = events(network, rows, 1)
-        weights = CountWeights(self.step * len(drawn) + 1)
+        weights = CountWeights(self.step * len(drawn))
         ledger = Ledger(None if self.quantity == CLAIMED else kinds)
         estimator = rule_of(self.estimator)(ledger, labels, shared=self.shared, relabellings=permutations)
         groups = tuple(orbits(self.agents, permutations))
@@ -196,6 +196,7 @@ class GeneralForm:
             for ids, weight in zip(view.ids, ending.weights, strict=True):
                 for cell, factor in enumerate(factor_of):
                     parts = [(int(ids[index[cell]]), sign) for sign, index in view.terms]
+                    parts += [] if view.always is None else [(view.always, 1)]
                     value = ledger.combine(ending.step, [(v, sign) for v, sign in parts if v >= 0])
                     both = np.convolve(
                         np.convolve(_exact(weight), _exact(factor)),
