@@ -76,6 +76,7 @@ def read_network(check: Checker, table: Mapping[str, Any], agent_tables: Tables 
         radio=radio,
         delays=delays,
         counts=counts,
+        scale=1.0 if scale is None else scale,
     )
 
 
@@ -158,7 +159,20 @@ def _counts(check: Checker, table: Mapping[str, Any], agents: int) -> tuple[np.n
             "network.received", f"at most what was sent, {sent[i, j]:g}", f"{received[i, j]:g} ({i + 1}, {j + 1})"
         )
         return None
+    others = ("burst", "radio") if _are_ratios(table.get("link"), sent, received) else ("link", "burst", "radio")
+    for key in others:
+        if table.get(key) is not None:
+            check.note(f"network.{key}", "either numbers of packets (network.sent, network.received) or this", "both")
     return sent, received
+
+
+def _are_ratios(link: Any, sent: np.ndarray, received: np.ndarray) -> bool:
+    """Whether link probabilities say no more than the numbers of packets, as those of a log do."""
+    try:
+        given = np.array(link, dtype=float)
+    except (TypeError, ValueError):
+        return True  # which is noted where links are read
+    return given.shape == sent.shape and np.allclose(np.where(sent > 0, given, 0.0) * sent, received)
 
 
 def _ratios(check: Checker, sent: np.ndarray, received: np.ndarray, hears: np.ndarray | None) -> list[list[float]]:
