@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from stochfuse.kalman.checks import shown
-from stochfuse.scenario.checker import Checker
+from stochfuse.scenario.checker import Checker, table_of
 from stochfuse.scenario.model import Filter, Model, NoiseCorrelation, Sensor
 from stochfuse.scenario.motion import KEYS, read_motion, read_step
 from stochfuse.scenario.network import ARCHITECTURES, Network, mean_delivery, possible_senders
 from stochfuse.scenario.radio import links_between, read_places, read_radio
-from stochfuse.scenario.sensing import sometimes
+from stochfuse.scenario.sensing import is_named, sometimes
 
 MOST_DELAY = 10_000
 """Largest delay of a message, in steps."""
@@ -388,9 +388,7 @@ def _sensor(
         R = check.covariance(f"{path}.R", table.get("R"), None if H is None else H.shape[-2], steps, definite=True)
     if H is None or R is None:
         return None
-    inherited = default is not None and table.get("H") is None and table.get("R") is None
-    detection = default.detection if default is not None and inherited else None
-    return sometimes(check, f"{path}.sensor", table.get("sensor"), Sensor(H, R, detection), steps)
+    return sometimes(check, f"{path}.sensor", table.get("sensor"), Sensor(H, R), steps)
 
 
 def read_sensors(
@@ -401,11 +399,16 @@ def read_sensors(
     filters: Sequence[Filter],
     network: Network | None,
     named: Mapping[int, Sensor | None],
+    model: Mapping[str, Any],
 ) -> tuple[tuple[Sensor, ...], tuple[int, ...]]:
     """Read [[agent]]: the different sensors, and which of them every agent has.
 
+    When an agent measures that has not both H and R of its own is what model.sensor says, but for what its own sensor
+    table says.
+
     Parameters
     ----------
+    model : [model].
     named : sensors by name, by agent counted from 0; None where something is wrong with one.
     """
     default = named.get(0) if named and not agents else default
@@ -418,6 +421,9 @@ def read_sensors(
         return (), ()
     different: dict[tuple[Any, ...], int] = {}
     sensors, sensor_of = [], []
+    when = {} if is_named(model.get("sensor")) or check.problems else table_of(model, "sensor")
+    if when:
+        default = _sensor(Checker(), "model", {"H": model.get("H"), "R": model.get("R")}, d, network.steps, None)
     for i, table in enumerate(agents, start=1):
         path = f"agent[{i}]"
         size = filters[i - 1].dimension if filters else d
@@ -432,6 +438,8 @@ def read_sensors(
             for key in ("H", "R"):
                 if fitting is None and key not in table:
                     check.note(f"{path}.{key}", "a sensor of its own, or sensor = false", "nothing")
+            if when and fitting is not None and None in (table.get("H"), table.get("R")):
+                table = {**table, "sensor": {**when, **table_of(table, "sensor")}}
             sensor = _sensor(check, path, table, size, network.steps, fitting)
         if sensor is None:
             continue
