@@ -296,8 +296,8 @@ class AgentTable(StrictTable):
     R: Matrix | None = None
     sensor: SensorChoice = Field(
         True,
-        description="a sensor by name in the place of H and R; period, offset and detection alone: when it measures, in "
-        "the place of what model.sensor says; false: this agent measures nothing itself",
+        description="a sensor by name in the place of H and R; period, offset and detection alone: when it measures, "
+        "in the place of what model.sensor says; false: this agent measures nothing itself",
     )
     F: Matrix | None = Field(None, description="transition of the agent's own filter")
     Q: Matrix | None = Field(None, description="process noise of the agent's own filter")

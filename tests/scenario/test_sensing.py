@@ -272,7 +272,7 @@ def test_an_agent_says_when_it_measures_with_the_models_sensor():
         ({"sensor": False}, {"sensor": False}),
     ],
 )
-def test_when_the_models_H_and_R_measure(table, meant):
+def test_when_matrices_of_the_model_measure(table, meant):
     source = {"model": {"F": 1, "H": 1, "Q": 1, "R": 1}, "initial": {"P": 4}, "network": {"agents": 2, "steps": 5}}
     common = {**source, "model": {**source["model"], "sensor": {"period": 2, "detection": 0.5}}}
     last = {"H": 2.0, "R": 3.0}
