@@ -363,7 +363,10 @@ def _lengthened(scenario: Scenario, last: int, tables: Mapping[str, _RawTable]) 
 
 
 def _runs(tables: Mapping[str, _RawTable]) -> tuple[str, ...]:
-    """Names of the runs, numbers in their order; every file that has runs has all of them."""
+    """Names of the runs, numbers in their order; every file that has runs has all of them.
+
+    In a run that has first estimates nothing may have been measured.
+    """
     found: dict[str, None] = {}
     for table in tables.values():
         found.update(dict.fromkeys(table.run.names if table.run is not None else ()))
@@ -372,8 +375,11 @@ def _runs(tables: Mapping[str, _RawTable]) -> tuple[str, ...]:
         return ALONE
     if all(name.removeprefix("-").isdecimal() for name in names):
         names.sort(key=int)
+    first = tables.get("first")
+    begun = () if first is None or first.run is None else first.run.names
     for what, table in tables.items():
         there = set(names if table.run is None else table.run.names)
+        there.update(begun if what == "measurements" else ())
         lost = [name for name in names if name not in there]
         if lost and what in ("measurements", "truth", "first"):
             other = next(t for t in tables.values() if t.run is not None and lost[0] in t.run.names)

@@ -269,7 +269,7 @@ def _expected(sizes: list[int], candidates: int, relabellings: int) -> int:
     """Return how many states the next layer will have, judged by the growth so far, at first by the symmetry."""
     if len(sizes) == 1:
         return min(candidates, 1 + 3 * candidates // (2 * relabellings))
-    return int(min(candidates, 1.2 * sizes[-1] * sizes[-1] / sizes[-2]))
+    return max(1, int(min(candidates, 1.2 * sizes[-1] * sizes[-1] / sizes[-2])))
 
 
 def _extrapolated(sizes: list[int], expected: int, further: int) -> int:

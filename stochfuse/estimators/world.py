@@ -238,7 +238,8 @@ def sources_of(system: System, records: np.ndarray | None = None, *, by_agent: b
 
     Parameters
     ----------
-    records : measurements (steps, agents, p); with them every agent is a source of its own.
+    records : measurements (steps, agents, p); with them every agent is a source of its own.  Of an agent that measures
+        less than others what is left over does not matter.
     by_agent : whether that is so anyway; else every kind of sensor is one.
 
     Raises
@@ -250,7 +251,10 @@ def sources_of(system: System, records: np.ndarray | None = None, *, by_agent: b
     sensors = system.sensors
     if by_agent or records is not None:
         sensors = [system.sensors[kind] for kind in system.sensor_of]
-    columns = None if records is None else [[z[..., None] for z in step] for step in records]
+    columns = None
+    if records is not None:
+        widths = [sensor.H.shape[-2] for sensor in sensors]
+        columns = [[z[:p, None] for z, p in zip(step, widths, strict=True)] for step in records]
     return Sources(system.model, sensors, [start] * len(sensors), columns)
 
 

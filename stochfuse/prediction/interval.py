@@ -79,13 +79,13 @@ def posterior(network: Network, level: float, method: str, draws: int = DRAWS) -
     a, b = received[unsure] + 0.5, (sent - received)[unsure] + 0.5
     drawn = method in CHEAP
     if drawn:
-        rows = np.broadcast_to(network.link, (draws, *network.link.shape)).copy()
-        rows[:, unsure] = np.random.default_rng(SEED).beta(a, b, (draws, len(a)))
+        delivered = np.random.default_rng(SEED).beta(a, b, (draws, len(a)))
     else:
         deviation = np.sqrt(a * b / (a + b + 1)) / (a + b)
         moves = np.stack([np.diag(deviation), -np.diag(deviation)], axis=1).reshape(-1, len(a))
-        rows = np.broadcast_to(network.link, (2 * len(a), *network.link.shape)).copy()
-        rows[:, unsure] = np.clip(rows[:, unsure] + moves, 0.0, 1.0)
+        delivered = np.clip((received / np.maximum(sent, 1))[unsure] + moves, 0.0, 1.0)
+    rows = np.broadcast_to(network.link, (len(delivered), *network.link.shape)).copy()
+    rows[:, unsure] = np.minimum(1.0, network.scale * delivered)
     return Posterior(level, restricted(LinkRows(None, rows), network), drawn)
 
 

@@ -78,8 +78,8 @@ def predict_states(
     Parameters
     ----------
     scenario : the scenario; its initial.x is the estimate at step 1.
-    measurements : (steps, p): one record that stands for every agent's; or (steps, agents, p): each agent's own.  The
-        entry of step 1 is not used: nothing is measured before the first exchange.
+    measurements : (steps, p): one record that stands for every agent's; or (steps, agents, p): each agent's own, p
+        the most that any measures.  The entry of step 1 is not used: nothing is measured before the first exchange.
     link : link probabilities, one row each; default: those of the scenario.
     printed : evaluate (53) as the thesis prints it, with P(k) in front of the sum (one record only).
 
@@ -104,16 +104,21 @@ def predict_states(
     system = scenario.system
     steps, n = system.steps, system.agents
     sees = np.array([scenario.sensors[kind].H.shape[-2] for kind in scenario.sensor_of])
-    # what agents without a sensor are said to measure does not matter
+    # what agents without a sensor, or with fewer components than others, are said to measure there does not matter
     widths = set(sees[sees > 0].tolist()) or {z.shape[-1] if z.ndim else 0}
-    expected = (
-        f"(steps, p) or (steps, agents, p) with {steps} steps, {n} agents and p = {', '.join(map(str, sorted(widths)))}"
-    )
-    if len(widths) > 1 or z.ndim not in (2, 3) or len(z) < steps or z.shape[-1] not in widths:
-        raise UsageError(f"measurements: expected shape {expected}, got {z.shape}")
-    if z.ndim == 3 and z.shape[1] != n:
-        raise UsageError(f"measurements: expected shape {expected}, got {z.shape}")
-    if not np.isfinite(z[1:steps] if z.ndim == 2 else z[1:steps, sees > 0]).all():
+    forms = "(steps, agents, p)" if len(widths) > 1 else "(steps, p) or (steps, agents, p)"
+    if (
+        z.ndim not in (2, 3)
+        or (z.ndim == 2 and len(widths) > 1)
+        or len(z) < steps
+        or z.shape[-1] != max(widths)
+        or (z.ndim == 3 and z.shape[1] != n)
+    ):
+        raise UsageError(
+            f"measurements: expected shape {forms} with {steps} steps, {n} agents and p = {max(widths)}, got {z.shape}"
+        )
+    seen = np.arange(z.shape[-1]) < sees[:, None]
+    if not np.isfinite(z[1:steps] if z.ndim == 2 else z[1:steps, seen]).all():
         raise UsageError("measurements: expected finite numbers, got NaN or infinity")
     if z.ndim == 2 and len(scenario.sensors) == 1 and sees.all():
         x = _one_record(system, rows, z, printed)
@@ -121,7 +126,7 @@ def predict_states(
         raise UsageError("(53) as printed takes one record for all agents, of shape (steps, p)")
     else:
         own = np.broadcast_to(z[:, None], (len(z), n, z.shape[-1])) if z.ndim == 2 else z
-        x = _own_records(system, rows, np.where((sees > 0)[:, None], own, 0.0))
+        x = _own_records(system, rows, np.where(seen, own, 0.0))
     return States(rows.means(scenario.network), np.arange(1, steps + 1), x[..., 0], scenario.model.states)
 
 

@@ -81,7 +81,7 @@ def links_of_scenario(scenario: Scenario) -> Links:
     low = high = np.full_like(link, np.nan)
     sent, received = (None, None) if network.counts is None else (M.astype(int) for M in network.counts)
     if sent is not None and received is not None:
-        low, high = jeffreys(sent, received)
+        low, high = (np.minimum(1.0, network.scale * end) for end in jeffreys(sent, received))
     return Links(
         source=scenario.name,
         kind=_kind(network),

@@ -40,6 +40,7 @@ class Network:
     cases : named alternatives to `link`.
     delay : probabilities of a delay of 0, 1, 2 … steps; of unequal delays the longest are told by its length.
     counts : (n, n) packets sent to and received by each agent (receiver, sender), behind `link`; None if not known.
+    scale : factor on what was counted that `link` already has, as network.scale.
     delays : the same from each sender to each receiver, by (receiver, sender); None where all have one.
     burst : (4,) good→bad, bad→good, delivery in good, delivery in bad; None for links without memory.
     case_bursts : the same for each of the cases.
@@ -63,6 +64,7 @@ class Network:
     radio: Radio | None = None
     delays: tuple[tuple[tuple[float, ...], ...], ...] | None = None
     counts: tuple[np.ndarray, np.ndarray] | None = None
+    scale: float = 1.0
 
     def delay_of(self, receiver: int, sender: int) -> tuple[float, ...]:
         """Probabilities of a delay of 0, 1, 2 … steps of a link."""

@@ -459,7 +459,7 @@ def _build(mapping: Mapping[str, Any], name: str, structure: list[Problem]) -> S
     d = model.dimension if model else None
     filters = read_filters(check, agents, model, P0, own, network)
     named = read_named(check, tables["model"], agents, model, network, own)
-    sensors, sensor_of = read_sensors(check, agents, default, d, filters, network, named.sensors)
+    sensors, sensor_of = read_sensors(check, agents, default, d, filters, network, named.sensors, tables["model"])
     correlation = check.choice("initial.correlation", initial.get("correlation", "independent"), CORRELATIONS)
     if correlation == "shared" and (own or filters):
         check.note("initial.correlation", '"independent", since agents have states or filters of their own', "'shared'")

@@ -295,7 +295,9 @@ class AgentTable(StrictTable):
     H: Matrix | None = None
     R: Matrix | None = None
     sensor: SensorChoice = Field(
-        True, description="a sensor by name in the place of H and R; false: this agent measures nothing itself"
+        True,
+        description="a sensor by name in the place of H and R; period, offset and detection alone: when it measures, "
+        "in the place of what model.sensor says; false: this agent measures nothing itself",
     )
     F: Matrix | None = Field(None, description="transition of the agent's own filter")
     Q: Matrix | None = Field(None, description="process noise of the agent's own filter")

@@ -338,7 +338,7 @@ def sometimes(check: Checker, path: str, table: Any, sensor: Sensor, steps: int)
     detection = _detection(check, f"{path}.detection", table.get("detection", 1.0), steps)
     if due is not None and not due.all():
         H = over_steps(H, steps) * due[:, None, None]
-    return replace(sensor, H=H, detection=sensor.detection if "detection" not in table else detection)
+    return replace(sensor, H=H, detection=detection)
 
 
 class _SensingContext(NamedTuple):
@@ -430,7 +430,10 @@ def read_named(
             check.absent(path, agent, ("H", "R"), "nothing beside a sensor by name")
             sensor = _read(check, f"{path}.sensor", agent["sensor"], given)
         elif common and agent.get("sensor") is not False and not {"H", "R"} & set(agent):
-            sensor = default
+            # when it measures may be its own
+            when = table_of(agent, "sensor")
+            merged = {**common, **when}
+            sensor = _read(check, f"{path}.sensor", merged, given) if when and default is not None else default
         else:
             _place(check, path, agent.get("position"), given)
             continue

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from stochfuse.kalman.checks import shown
-from stochfuse.scenario.checker import Checker
+from stochfuse.scenario.checker import Checker, table_of
 from stochfuse.scenario.model import Filter, Model, NoiseCorrelation, Sensor
 from stochfuse.scenario.motion import KEYS, read_motion, read_step
 from stochfuse.scenario.network import ARCHITECTURES, Network, mean_delivery, possible_senders
 from stochfuse.scenario.radio import links_between, read_places, read_radio
-from stochfuse.scenario.sensing import sometimes
+from stochfuse.scenario.sensing import is_named, sometimes
 
 MOST_DELAY = 10_000
 """Largest delay of a message, in steps."""
@@ -76,6 +76,7 @@ def read_network(check: Checker, table: Mapping[str, Any], agent_tables: Tables 
         radio=radio,
         delays=delays,
         counts=counts,
+        scale=1.0 if scale is None else scale,
     )
 
 
@@ -158,7 +159,20 @@ def _counts(check: Checker, table: Mapping[str, Any], agents: int) -> tuple[np.n
             "network.received", f"at most what was sent, {sent[i, j]:g}", f"{received[i, j]:g} ({i + 1}, {j + 1})"
         )
         return None
+    others = ("burst", "radio") if _are_ratios(table.get("link"), sent, received) else ("link", "burst", "radio")
+    for key in others:
+        if table.get(key) is not None:
+            check.note(f"network.{key}", "either numbers of packets (network.sent, network.received) or this", "both")
     return sent, received
+
+
+def _are_ratios(link: Any, sent: np.ndarray, received: np.ndarray) -> bool:
+    """Whether link probabilities say no more than the numbers of packets, as those of a log do."""
+    try:
+        given = np.array(link, dtype=float)
+    except (TypeError, ValueError):
+        return True  # which is noted where links are read
+    return given.shape == sent.shape and np.allclose(np.where(sent > 0, given, 0.0) * sent, received)
 
 
 def _ratios(check: Checker, sent: np.ndarray, received: np.ndarray, hears: np.ndarray | None) -> list[list[float]]:
@@ -374,9 +388,7 @@ def _sensor(
         R = check.covariance(f"{path}.R", table.get("R"), None if H is None else H.shape[-2], steps, definite=True)
     if H is None or R is None:
         return None
-    inherited = default is not None and table.get("H") is None and table.get("R") is None
-    detection = default.detection if default is not None and inherited else None
-    return sometimes(check, f"{path}.sensor", table.get("sensor"), Sensor(H, R, detection), steps)
+    return sometimes(check, f"{path}.sensor", table.get("sensor"), Sensor(H, R), steps)
 
 
 def read_sensors(
@@ -387,11 +399,16 @@ def read_sensors(
     filters: Sequence[Filter],
     network: Network | None,
     named: Mapping[int, Sensor | None],
+    model: Mapping[str, Any],
 ) -> tuple[tuple[Sensor, ...], tuple[int, ...]]:
     """Read [[agent]]: the different sensors, and which of them every agent has.
 
+    When an agent measures that has not both H and R of its own is what model.sensor says, but for what its own sensor
+    table says.
+
     Parameters
     ----------
+    model : [model].
     named : sensors by name, by agent counted from 0; None where something is wrong with one.
     """
     default = named.get(0) if named and not agents else default
@@ -404,6 +421,9 @@ def read_sensors(
         return (), ()
     different: dict[tuple[Any, ...], int] = {}
     sensors, sensor_of = [], []
+    when = {} if is_named(model.get("sensor")) or check.problems else table_of(model, "sensor")
+    if when:
+        default = _sensor(Checker(), "model", {"H": model.get("H"), "R": model.get("R")}, d, network.steps, None)
     for i, table in enumerate(agents, start=1):
         path = f"agent[{i}]"
         size = filters[i - 1].dimension if filters else d
@@ -418,6 +438,8 @@ def read_sensors(
             for key in ("H", "R"):
                 if fitting is None and key not in table:
                     check.note(f"{path}.{key}", "a sensor of its own, or sensor = false", "nothing")
+            if when and fitting is not None and None in (table.get("H"), table.get("R")):
+                table = {**table, "sensor": {**when, **table_of(table, "sensor")}}
             sensor = _sensor(check, path, table, size, network.steps, fitting)
         if sensor is None:
             continue

@@ -166,6 +166,19 @@ def test_run_on_simulated_files_gives_the_same_estimates(name, tmp_path):
     assert (tmp_path / "e.csv").read_bytes() == (folder / "estimates.csv").read_bytes()
 
 
+def test_a_simulated_run_in_which_nothing_was_measured_can_be_run(tmp_path):
+    seldom = [{"sensor": {"detection": 0.3}}, {"sensor": False}]
+    source = sf.load_scenario("thesis-steady", agents=2, steps=2).to_mapping() | {"agent": seldom}
+    made = sf.simulate(source, 6, link=0.5, folder=tmp_path)
+    measured, drawn = ((tmp_path / f"{name}.csv").read_text() for name in ("measurements", "initial"))
+    assert measured.count("\n") < 1 + 6 < drawn.count("\n")
+    files = [tmp_path / f"{name}.csv" for name in ("measurements", "arrivals", "truth")]
+    again = sf.run(source, *files, initial=tmp_path / "initial.csv", predicted=False)
+    assert [row.realised for row in again.rows] == pytest.approx([row.realised for row in made.rows], rel=1e-12)
+    with pytest.raises(sf.UsageError, match="expected the same runs in all files"):
+        sf.run(source, *files, predicted=False)
+
+
 def test_a_folder_with_such_files_is_not_written_over(tmp_path):
     s = sf.load_scenario("thesis-steady", agents=2, steps=2)
     sf.simulate(s, 2, link=0.5, folder=tmp_path)

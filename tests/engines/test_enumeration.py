@@ -117,6 +117,14 @@ def test_more_agents_against_the_plain_enumeration(architecture, agents, steps):
     np.testing.assert_allclose(merged.covariance()[0, :, 0], plain.covariance()[0, :, 0], rtol=1e-11)
 
 
+def test_certain_exchanges_leave_fewer_states_than_before():
+    # after a step in which all hear all, nothing that the optimum knows tells the outcomes before it apart
+    network = {"agents": 2, "steps": 4, "link": [0.5, 1.0, 0.5, 1.0]}
+    one = {"model": {"F": 1, "H": 1, "Q": 1, "R": 1}, "initial": {"P": 1}, "network": network}
+    found = sf.predict(one, method="general", estimator="optimal")
+    np.testing.assert_allclose(found.values(), sf.predict(one, method="optimal").values(), rtol=1e-12)
+
+
 def test_coefficients_count_outcomes_by_arrivals():
     """A_c is the sum over outcomes with exactly c arrivals: with P = 1 everywhere it would be a binomial coefficient."""
     scenario = sf.load_scenario(agents=2, steps=2)

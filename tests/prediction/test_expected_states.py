@@ -67,6 +67,30 @@ def test_the_simplified_one_is_53():
     assert found.nature == "approximate"
 
 
+@pytest.mark.parametrize("method", ["simplified", "general"])
+def test_agents_may_measure_less_than_others(method):
+    # the second of two agents sees the velocity too: as one component that tells next to nothing, or not at all
+    both, one = {"H": np.eye(2).tolist(), "R": np.eye(2).tolist()}, {"H": [[1.0, 0.0]], "R": [[1.0]]}
+    blind = {"H": np.eye(2).tolist(), "R": [[1.0, 0.0], [0.0, 1e12]]}
+    z = np.array([[[0.0, 0.0]] * 2, [[1.0, 2.0], [3.0, -1.0]], [[2.0, 0.5], [4.0, 1.0]]])
+    less, more = (
+        sf.load_scenario({
+            "model": {"F": F, "Q": Q, "H": H, "R": R},
+            "initial": {"P": P0},
+            "network": {"agents": 2, "steps": 3},
+            "agent": [first, both],
+        })
+        for first in (one, blind)
+    )  # fmt: skip
+    found = sf.expected_states(less, z, [0.4], method).x
+    np.testing.assert_allclose(found, sf.expected_states(more, z, [0.4], method).x, rtol=1e-9)
+    if method == "simplified":
+        with pytest.raises(
+            sf.UsageError, match=r"expected shape \(steps, agents, p\) with 3 steps, 2 agents and p = 2"
+        ):
+            sf.predict_states(less, z[:, 0], [0.4])
+
+
 def test_sensors_by_name_are_linearised_about_the_nominal_path():
     s = sf.load_scenario("two-radars", steps=3)
     h = np.zeros((3, 2, 2))

@@ -42,6 +42,24 @@ def test_two_agents_by_hand():
     assert s.network.link[0, 1] == 0.6
 
 
+@pytest.mark.parametrize("method", ["simplified", "general"])
+@pytest.mark.parametrize("scale", [0.5, 1.5])
+def test_a_scaled_network_has_the_scaled_ends(scale, method):
+    """Of one counted link scaled by c the interval is that of min(1, c µ)."""
+    source = featured.source(())
+    only = {"sent": [[0, 400], [0, 0]], "received": [[0, 300], [0, 0]], "hears": [[2], []], "scale": scale}
+    source["network"] = {"agents": 2, "steps": 2, **only}
+    found = sf.predict(source, method=method, interval=0.95)
+    ends = [[[0, min(1.0, scale * µ)], [0, 0]] for µ in beta.ppf([0.975, 0.025], 300.5, 100.5)]
+    expected = sf.predict(source, ends, method).values(agent=1)
+    if scale == 0.5:
+        np.testing.assert_allclose([found.low(agent=1)[0], found.high(agent=1)[0]], expected, rtol=0.005)
+    else:
+        np.testing.assert_allclose([found.low(agent=1)[0], found.high(agent=1)[0]], expected, rtol=1e-12)
+    shown = sf.links(sf.load_scenario(source))
+    assert shown.low[0, 1] <= shown.link[0, 1] <= shown.high[0, 1]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("packets", [200, 2000])
 def test_draws_and_derivatives_agree_where_much_is_known(packets):
@@ -93,6 +111,9 @@ def test_intervals_by_derivatives_hold_the_true_value():
         ({"received": [[0, 30], [3, 0]]}, r"network\.received: expected at most what was sent, 20, got 30"),
         ({"sent": [[0, 0.5], [1, 0]]}, r"network\.sent: expected a 2×2 matrix of whole numbers"),
         ({"sent": [[0, 0], [20, 0]], "received": [[0, 0], [3, 0]]}, r"network\.sent\[1\]\[2\]: expected packets, or"),
+        ({"link": 0.2}, r"network\.link: expected either numbers of packets .* or this, got both"),
+        ({"link": [[0, 0.6], [0.2, 0]]}, r"network\.link: expected either numbers of packets .* or this, got both"),
+        ({"burst": {"good_to_bad": 0.1, "bad_to_good": 0.5}}, r"network\.burst: expected either numbers of packets"),
     ],
 )
 def test_bad_counts(change, message):

@@ -249,6 +249,37 @@ def test_the_models_sensor_at_every_place():
     assert sf.load_scenario(mapping).sensors[1].H.shape == (0, 4)
 
 
+def test_an_agent_says_when_it_measures_with_the_models_sensor():
+    mapping, common = scenario(), {"kind": "range-bearing", "sigma": [5.0, 0.02], "period": 2}
+    mapping["model"]["sensor"] = common
+    mapping["agent"][0]["sensor"], mapping["agent"][1]["sensor"] = {"detection": 0.5}, {"period": 3, "offset": 1}
+    own = scenario()
+    own["agent"][0]["sensor"] = {**common, "detection": 0.5}
+    own["agent"][1]["sensor"] = {**common, "period": 3, "offset": 1}
+    assert seen(mapping, 1) == [2, 5]
+    np.testing.assert_array_equal(sf.predict(mapping).by_group, sf.predict(own).by_group)
+
+
+@pytest.mark.parametrize(
+    ("table", "meant"),
+    [
+        ({}, {"sensor": {"period": 2, "detection": 0.5}}),
+        ({"sensor": {"period": 1}}, {"sensor": {"detection": 0.5}}),
+        ({"R": 9.0, "sensor": {"detection": 1.0}}, {"R": 9.0, "sensor": {"period": 2}}),
+        ({"R": 9.0}, {"R": 9.0, "sensor": {"period": 2, "detection": 0.5}}),
+        ({"H": 3.0}, {"H": 3.0, "sensor": {"period": 2, "detection": 0.5}}),
+        ({"H": 3.0, "R": 9.0}, {"H": 3.0, "R": 9.0}),
+        ({"sensor": False}, {"sensor": False}),
+    ],
+)
+def test_when_matrices_of_the_model_measure(table, meant):
+    source = {"model": {"F": 1, "H": 1, "Q": 1, "R": 1}, "initial": {"P": 4}, "network": {"agents": 2, "steps": 5}}
+    common = {**source, "model": {**source["model"], "sensor": {"period": 2, "detection": 0.5}}}
+    last = {"H": 2.0, "R": 3.0}
+    found = sf.predict({**common, "agent": [table, last]}, [0.3])
+    np.testing.assert_array_equal(found.by_group, sf.predict({**source, "agent": [meant, last]}, [0.3]).by_group)
+
+
 def test_velocities():
     mapping = scenario(model__nominal=None)
     mapping["agent"] = [{"sensor": {"kind": "position-velocity", "sigma": [1, 1, 2, 2]}}, {"sensor": False}]
