@@ -64,6 +64,8 @@ UNLIKELY = 5.0
 """Standard errors of the optimum's mean from its expectation that tell of outcomes that were not met."""
 UNMET = 0.004
 """What the numbers heard leave of an outcome too rare to be met, about, relative to the value; so rare: 1/runs."""
+LEFT = 0.01
+"""What they leave of the optimum's variance, about."""
 FLAT = 1e-12
 """Least eigenvalue of a covariance, scaled to unit variances, that is rounding."""
 MOST_NUMBERS, MOST_STATES, MOST_SETS = 20_000_000, 600, 8
@@ -238,15 +240,21 @@ class FollowedOptimum:
             return expectation(system, links)
         if self.heard is None:
             return None
-        return ControlExpectation(self.heard.expected(), np.zeros((len(links.link), system.steps)))
+        return ControlExpectation(self.expected_heard, np.zeros((len(links.link), system.steps)))
+
+    @cached_property
+    def expected_heard(self) -> Moments:
+        """What is expected of what stands in for the optimum."""
+        if self.heard is None:
+            raise ValueError("nothing stands in for the optimum")
+        return self.heard.expected()
 
     def expected_beside(self, runs: int) -> ControlExpectation | None:
         """What is expected of it, and how far a mean of so many runs may be off by what they did not meet."""
         found = self.expected
         if found is None or self.kind == KIND:
             return found
-        first = np.arange(found.bound.shape[1]) == 0  # where it is the optimum
-        return found._replace(bound=found.bound + np.where(first, 0.0, UNMET / runs))
+        return found._replace(bound=found.bound + _unmet(self._asked[0], runs))
 
     @cached_property
     def heard(self) -> Heard | None:
@@ -308,27 +316,55 @@ def expectation(system: System, links: LinkRows) -> ControlExpectation | None:
     return ControlExpectation(Moments(P, P, None, P) if system.error is None else Moments(P, P, b, M), found.bound)
 
 
-def estimated(system: System, links: LinkRows, how: Settings, correlation: float) -> ControlExpectation:
-    """Estimate the optimum's expectation from further runs that carry it alone.
+def estimated(
+    system: System, links: LinkRows, how: Settings, correlation: float, optimum: FollowedOptimum
+) -> ControlExpectation:
+    """Estimate the optimum's expectation from further runs that carry it alone, with the numbers heard as its control.
 
     Parameters
     ----------
     correlation : ρ² of the optimum and what is asked for, about.
+    optimum : what goes with the sample's own runs.
     """
     least, most = FURTHER
-    best = sqrt(COSTS[how.estimator not in SUMS] * correlation / max(1.0 - correlation, 1e-9)) - 1.0
+    left = 1.0 if optimum.heard is None else LEFT
+    best = sqrt(left * COSTS[how.estimator not in SUMS] * correlation / max(1.0 - correlation, 1e-9)) - 1.0
     further = min(max(best, least), most)
     runs = ceil(further * how.runs)
     numbers = len(links.link) * system.steps * system.agents * system.dimension**2
     size = max(2, min(size_of_block(system.agents), -(-runs // (2 * BLOCKS)), MOST_HELD // numbers))
     blocks = -(-runs // size)
     follow = partial(sample_optimum, system, links, size, how.seed, workers=how.workers)
-    found = [_mean(follow(first=SEPARATE + block)) for block in range(blocks)]
-    means = Moments(*(None if m[0] is None else np.stack(m, axis=1) for m in zip(*found, strict=True)))
-    bound = np.zeros((len(links.link), system.steps))
+    means, stand_in = [], []
+    for block in range(blocks):
+        drawn = follow(first=SEPARATE + block)
+        means.append(_mean(drawn.P, drawn.bias))
+        if optimum.heard is not None:
+            stand_in.append(_mean(*optimum.heard.of(drawn.heard)))
+    bound, means = np.zeros((len(links.link), system.steps)), _by_block(means)
+    if optimum.heard is not None:
+        bound += _unmet(system, blocks * size)
+        by_block = zip(means, _by_block(stand_in), optimum.expected_heard, strict=True)
+        means = Moments(*(None if m is None else _corrected_blocks(m, x, mean) for m, x, mean in by_block))
     return ControlExpectation(means.map(lambda m: m.mean(axis=1)), bound, means, blocks * size / how.runs)
 
 
-def _mean(drawn: OptimumSample) -> Moments:
+def _mean(P: np.ndarray, bias: np.ndarray | None) -> Moments:
     """Mean moments of the optimum in some runs, (rows, steps, agents, …)."""
-    return Moments.of_optimum(drawn.P, drawn.bias).map(lambda m: m.mean(axis=1))
+    return Moments.of_optimum(P, bias).map(lambda m: m.mean(axis=1))
+
+
+def _by_block(found: Sequence[Moments]) -> Moments:
+    return Moments(*(None if m[0] is None else np.stack(m, axis=1) for m in zip(*found, strict=True)))
+
+
+def _corrected_blocks(m: np.ndarray, x: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """Means of blocks (rows, blocks, …), corrected by what stands in for them and its expectation (rows, …)."""
+    off = x - mean[:, None]
+    return np.stack([of_row - coefficients(of_row, by) * by for of_row, by in zip(m, off, strict=True)])
+
+
+def _unmet(system: System, runs: int) -> np.ndarray:
+    """How far, relatively, a mean corrected by the numbers heard may be off by what its runs did not meet, (steps,)."""
+    first = np.arange(system.steps) == 0  # where they say all
+    return np.where(first, 0.0, UNMET / runs)

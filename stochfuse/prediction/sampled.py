@@ -341,7 +341,7 @@ def helped(
     found = replace(plain, control=Control(runs, expected or own))
     reduction = _reduction(plain, found, system, shown)
     if expected is None and reduction >= WORTH:
-        expected = estimated(system, links, how, 1.0 - 1.0 / reduction)
+        expected = estimated(system, links, how, 1.0 - 1.0 / reduction, optimum)
         found = replace(plain, control=Control(runs, expected))
         reduction = _reduction(plain, found, system, shown)
     if reduction == 0.0:  # nothing is uncertain
