@@ -87,11 +87,16 @@ class Sample(NamedTuple):
     Parameters
     ----------
     values : named tuple of arrays (values, …), the different ones.
-    which : (rows, runs, steps, agents) which of them each agent has.
+    which : (rows, runs, steps, agents) which of them each agent has, −1 at steps to which a run was not followed.
     """
 
     values: Any
     which: np.ndarray
+
+    def followed(self, step: int) -> np.ndarray | slice:
+        """Runs that were followed to a step, counted from 0: the same of every row."""
+        there = self.which[0, :, step, 0] >= 0
+        return slice(None) if there.all() else there
 
 
 def sample(experiment: Experiment, rows: int, *, workers: int = 1) -> Sample:

@@ -93,18 +93,17 @@ class ControlExpectation(NamedTuple):
     bound : (rows, steps) proved relative half-width of it.
     further : the same of blocks of runs that carry the optimum alone, (rows, blocks, steps, agents, …), their mean the
         mean; None where it is known.
-    runs : how many further runs there are to every run.
+    runs : how many further runs there are.
     """
 
     mean: Moments
     bound: np.ndarray
     further: Moments | None = None
-    runs: float = 0.0
+    runs: int = 0
 
-    @property
-    def weight(self) -> float:
-        """How much of the difference of sample and expectation is corrected, w."""
-        return 1.0 if self.further is None else self.runs / (1.0 + self.runs)
+    def weight(self, runs: int) -> float:
+        """How much of the difference of so many runs' mean and the expectation is corrected, w."""
+        return 1.0 if self.further is None else self.runs / (self.runs + runs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,12 +119,15 @@ class Control:
     runs: Moments
     expected: ControlExpectation
 
-    def corrected(self, y: Moments, row: int, step: int, group: Sequence[int]) -> tuple[Moments, Moments | None]:
+    def corrected(
+        self, y: Moments, row: int, step: int, group: Sequence[int], followed: np.ndarray | slice
+    ) -> tuple[Moments, Moments | None]:
         """Terms of the sum, (runs, …), and what the further runs do to their mean, block by block, (blocks, …).
 
         Parameters
         ----------
-        y : what is asked for in every run, averaged over a group of agents, (runs, …).
+        y : what is asked for in every run followed to the step, averaged over a group of agents, (runs, …).
+        followed : these runs.
         """
         terms, moved, agents = [], [], list(group)
         further = self.expected.further or Moments(*(None,) * len(y))
@@ -134,23 +136,25 @@ class Control:
                 terms.append(m)
                 moved.append(m if m is None else 0.0 * m[:1])
                 continue
-            off = x[row, :, step][:, agents].mean(axis=1) - mean[row, step][agents].mean(axis=0)
-            β = coefficients(m, off)
-            corrected = m - self.expected.weight * β * off
+            off = x[row, followed, step][:, agents].mean(axis=1) - mean[row, step][agents].mean(axis=0)
+            β, weight = coefficients(m, off), self.expected.weight(len(m))
+            corrected = m - weight * β * off
             if _indefinite(corrected) and not _indefinite(m):
                 β, corrected = 0.0 * β, m
             terms.append(corrected)
             if more is not None:
                 blocks = more[row, :, step][:, agents].mean(axis=1)
-                moved.append(self.expected.weight * β.mean(axis=0) * (blocks - blocks.mean(axis=0)))
+                moved.append(weight * β.mean(axis=0) * (blocks - blocks.mean(axis=0)))
         return Moments(*terms), None if self.expected.further is None else Moments(*moved)
 
-    def applied(self, y: np.ndarray, row: int, step: int, group: Sequence[int]) -> np.ndarray:
+    def applied(
+        self, y: np.ndarray, row: int, step: int, group: Sequence[int], followed: np.ndarray | slice
+    ) -> np.ndarray:
         """Terms (runs,) of a number that every run has, corrected by the trace of the optimum; where that is exact."""
         if self.expected.further is not None:
             return y
         x, mean = (
-            np.trace(P, axis1=-2, axis2=-1) for P in (self.runs.P[row, :, step], self.expected.mean.P[row, step])
+            np.trace(P, axis1=-2, axis2=-1) for P in (self.runs.P[row, followed, step], self.expected.mean.P[row, step])
         )
         off = x[:, list(group)].mean(axis=1) - mean[list(group)].mean()
         return y - coefficients(y, off, 0.0) * off
@@ -346,7 +350,7 @@ def estimated(
         bound += _unmet(system, blocks * size)
         by_block = zip(means, _by_block(stand_in), optimum.expected_heard, strict=True)
         means = Moments(*(None if m is None else _corrected_blocks(m, x, mean) for m, x, mean in by_block))
-    return ControlExpectation(means.map(lambda m: m.mean(axis=1)), bound, means, blocks * size / how.runs)
+    return ControlExpectation(means.map(lambda m: m.mean(axis=1)), bound, means, blocks * size)
 
 
 def _mean(P: np.ndarray, bias: np.ndarray | None) -> Moments:
