@@ -20,6 +20,7 @@ import numpy as np
 
 from stochfuse.engines.events import ChanceEvent
 from stochfuse.engines.progress import listener, uncollected
+from stochfuse.errors import NoAnswerError
 from stochfuse.estimators.protocol import Claims, Estimator, Exchange, Late, StepOutcomes, Together
 from stochfuse.kalman.kernel import Estimate
 from stochfuse.scenario.system import Detection
@@ -197,7 +198,11 @@ def _run_together(experiment: Experiment, blocks: Sequence[RunBlock]) -> tuple[A
             follows = experiment.together(some.stop - first)
             which = np.empty((some.stop - first, len(links), experiment.agents), np.int32)
             for step, now in enumerate(steps):
-                estimate, index = follows.exchange(of_runs(now, some, experiment.agents))
+                try:
+                    estimate, index = follows.exchange(of_runs(now, some, experiment.agents))
+                except NoAnswerError as error:
+                    before = block.number * size_of_block(experiment.agents) + first + 1
+                    raise NoAnswerError("".join(f"run {before + run}: " for run in error.items) + f"{error}") from None
                 parts.append(experiment.of(estimate))
                 which[:, step] = index + values
                 values += len(parts[-1][0])
