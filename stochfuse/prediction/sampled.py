@@ -7,7 +7,7 @@ through by the metric's derivative at the mean (delta method), taken by central 
 A control takes away what is common and leaves what is rare and skewed.  Of terms of skewness γ the mean over its own
 standard error s/√R is not standard normal: E[t] = −γ/(2√R), Var t = 1 + (2 + 7γ²/4)/R to first order (Hall 1992, The
 Bootstrap and Edgeworth Expansion, 2.6), though the mean itself is unbiased.  So a corrected sample's error is
-(1 + 2γ²/R)^½ s/√R, by which E[t²] is that of symmetric terms.
+(1 + 2(1 + γ²)/R)^½ s/√R, by which E[t²] is 1, of a few runs too.
 
 Wherever it helps, the exact optimum is the sample's control variate (`stochfuse.prediction.control`), and of the
 optimum of many agents itself a filter of the numbers heard.  How many runs a
@@ -155,7 +155,7 @@ class MomentSample:
             shown[row, step] = of(mean)
             variance, skewness = _spread(of, mean, terms.map(lambda m: m - m.mean(axis=0)))
             if self.control is not None:
-                variance *= 1.0 + 2.0 * skewness**2 / _runs(terms)
+                variance *= 1.0 + 2.0 * (1.0 + skewness**2) / _runs(terms)
             error = np.sqrt(variance + (_spread(of, mean, _averaged(moved, share))[0] if moved else 0.0))
             constant, rounding = all(_constant(m) for m in drawn), ROUNDING * np.abs(shown[row, step])
             if constant or self.control is None:

@@ -29,7 +29,7 @@ import numpy as np
 from stochfuse.engines.monte_carlo import BLOCK
 from stochfuse.engines.progress import within
 
-FIRST, FEWEST = 400, 24
+FIRST, FEWEST = 400, 16
 """Most and fewest runs of the first stage."""
 GROWTH = 40
 """How many times as many runs a stage makes of those before."""
