@@ -6,10 +6,10 @@ runs that carry the optimum alone.  Entry by entry of covariances, biases and st
 like agents,
 
     E[Y] ≈ 1/R Σ_r Y_r − β_(r) w (X_r − E[X])            w = 1        where E[X] is exact
-                                                         w = 1 − R/N  where it is the mean of the N − R further runs
+                                                         w = 1 − R/N  where it is that of the N − R further runs
 
 Of the optimum itself, sampled, X is a filter of the numbers heard (`stochfuse.engines.heard`), of known expectation for
-any network.  At step 1 the two are one.  Where nearly all that varies is taken away, what is left comes of outcomes so
+any network; by it the mean of further runs is corrected too.  At step 1 the two are one.  Where nearly all that varies is taken away, what is left comes of outcomes so
 rare that a sample may not have met one: at later steps so much is added to the error, `UNMET`.
 
 The coefficient β_(r) = cov(Y, X)/var(X) is that of all blocks of runs but the one that r is in (splitting: Nelson 1990,
