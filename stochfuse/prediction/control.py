@@ -9,8 +9,9 @@ like agents,
                                                          w = 1 − R/N  where it is that of the N − R further runs
 
 Of the optimum itself, sampled, X is a filter of the numbers heard (`stochfuse.engines.heard`), of known expectation for
-any network; by it the mean of further runs is corrected too.  At step 1 the two are one.  Where nearly all that varies is taken away, what is left comes of outcomes so
-rare that a sample may not have met one: at later steps so much is added to the error, `UNMET`.
+any network; by it the mean of further runs is corrected, too.  At step 1 both are one.  Where nearly all that varies
+is taken away, what is left comes of outcomes so rare that a sample may not have met one: at later steps so much is
+added to the error, `UNMET`.
 
 The coefficient β_(r) = cov(Y, X)/var(X) is that of all blocks of runs but the one that r is in (splitting: Nelson 1990,
 Operations Research 38, 974; Avramidis and Wilson 1993, Operations Research Letters 14, 187).  So it is independent of
