@@ -15,10 +15,9 @@ With `shared`, one more column holds the common start.  Of many rows at once,
 Sets met before by the same run, whoever met them and when, are not gone through again.  A row is told by a hash of 64
 bits, so that two rows are confused once in 10^19 pairs.
 
-Where many sets meet in pairs but not in threes, and process noise is large beside what is shared, the rule subtracts
-more than there is: four sets of three starts each, every two with one in common, leave 4 (f(3/P0) + J) − 6 f(1/P0) with
-f(Y) = Y/(1 + QY), −23/175 at P0 = 1, Q = 9, R = 100.  That is not rounding, and is refused: dense networks of twenty
-agents and two states meet it in nearly every outcome.
+Where sets meet in pairs alone the rule subtracts more than there is: four sets of three starts each, every two with one
+in common, leave 4 (f(3/P0) + J) − 6 f(1/P0) with f(Y) = Y/(1 + QY), −23/175 at P0 = 1, Q = 9, R = 100.  Not rounding,
+and refused: dense networks of twenty agents and two states meet it in nearly every outcome.
 
 The same numbers as those of `stochfuse.estimators.local_fusion_graph`, which writes down what it does before any number
 is put in; here sums that cancel meet in floating point, which costs a few digits of the sixteen.

@@ -245,14 +245,7 @@ class FollowedOptimum:
             return expectation(system, links)
         if self.heard is None:
             return None
-        return ControlExpectation(self.expected_heard, np.zeros((len(links.link), system.steps)))
-
-    @cached_property
-    def expected_heard(self) -> Moments:
-        """What is expected of what stands in for the optimum."""
-        if self.heard is None:
-            raise ValueError("nothing stands in for the optimum")
-        return self.heard.expected()
+        return ControlExpectation(self.heard.expected(), np.zeros((len(links.link), system.steps)))
 
     def expected_beside(self, runs: int) -> ControlExpectation | None:
         """What is expected of it, and how far a mean of so many runs may be off by what they did not meet."""
@@ -349,7 +342,7 @@ def estimated(
     bound, means = np.zeros((len(links.link), system.steps)), _by_block(means)
     if optimum.heard is not None:
         bound += _unmet(system, blocks * size)
-        by_block = zip(means, _by_block(stand_in), optimum.expected_heard, strict=True)
+        by_block = zip(means, _by_block(stand_in), optimum.heard.expected(), strict=True)
         means = Moments(*(None if m is None else _corrected_blocks(m, x, mean) for m, x, mean in by_block))
     return ControlExpectation(means.map(lambda m: m.mean(axis=1)), bound, means, blocks * size)
 

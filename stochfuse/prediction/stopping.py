@@ -8,13 +8,8 @@ share s of a standard error in its value, and then
 
 runs in all, that the first stage's luck with its variance does not leave the second one short.  Where it does so all
 the same, or where R would be more than `GROWTH` times R_1, a further stage is fixed in the same way from all runs there
-are.
-
-Steps need runs each of their own: what is brought forward for the first time varies most.  Where runs are dear, those
-that only early steps need end there: R is fixed for every step, all runs are followed to a step k, and as many as the
-steps after k need to the end, with k such that the fewest steps are followed.
-
-A limit of time looks at the clock, never at the values: the runs that fit are the answer.
+are.  A limit of time looks at the clock, never at the values: the runs that fit are the answer.  Where runs are dear, R
+is fixed for every step, and those that only early steps need end there.
 """
 
 from __future__ import annotations
@@ -35,8 +30,6 @@ GROWTH = 40
 """How many times as many runs a stage makes of those before."""
 PARTS = 8
 """Parts that a stage is drawn in, after each of which the time left is told."""
-SAVED = 0.9
-"""Share of the steps that are followed below which it pays to end some runs early."""
 FEW = 20
 """Runs that show what a run takes, and for which no further part is begun."""
 
@@ -143,13 +136,10 @@ def sampled_to(
 
 
 def lengths(wanted: np.ndarray) -> np.ndarray:
-    """Runs that are followed to every step, where so many are wanted: of two lengths, or one if that saves little."""
+    """Runs that are followed to every step, where so many are wanted: of two lengths, and fewest steps in all."""
     need, steps = np.maximum.accumulate(wanted[::-1])[::-1], np.arange(len(wanted))
-    cost = need[0] * steps + need * (len(steps) - steps)
-    early = int(cost.argmin())
-    return (
-        np.where(steps < early, need[0], need[early]) if cost[early] < SAVED * cost[0] else np.full_like(need, need[0])
-    )
+    early = int((need[0] * steps + need * (len(steps) - steps)).argmin())
+    return np.where(steps < early, need[0], need[early])
 
 
 def stage(runs: int, excess: float) -> int:

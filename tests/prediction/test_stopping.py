@@ -34,8 +34,7 @@ def test_runs_of_two_lengths_follow_fewest_steps(seed):
     ways = [np.where(np.arange(len(wanted)) < k, wanted.max(), wanted[k:].max()) for k in range(len(wanted))]
     enough = [way for way in ways if (way >= wanted).all()]
     assert any((found == way).all() for way in enough)
-    least = min(way.sum() for way in enough)
-    assert found.sum() == (least if least < stopping.SAVED * wanted.max() * len(wanted) else wanted.max() * len(wanted))
+    assert found.sum() == min(way.sum() for way in enough)
 
 
 def test_runs_that_only_early_steps_need_end_there(monkeypatch):
