@@ -265,21 +265,21 @@ def _of_outcomes(probability: Callable[[int], np.ndarray], parts: Parts, rows: i
 
 
 def _of_sample(sampled: MomentSample, parts: Parts, step: int, group: int) -> ColumnExpectation:
-    agents, index = list(sampled.groups[group]), sampled.sample.which
+    agents, followed = list(sampled.groups[group]), sampled.sample.followed(step - 1)
+    index = sampled.sample.which[:, followed, step - 1][:, :, agents]
     means, variances, thirds = parts.cumulants
     rows, runs = index.shape[:2]
     drawn, variance, third = np.empty((rows, runs)), np.empty(rows), np.empty(rows)
     for row in range(rows):
-        which = index[row, :, step - 1][:, agents]
-        drawn[row] = means[which].mean(axis=1)
+        drawn[row] = means[index[row]].mean(axis=1)
         if sampled.control is not None:
-            drawn[row] = sampled.control.applied(drawn[row], row, step - 1, agents)
-        used, counts = np.unique(which, return_counts=True)
+            drawn[row] = sampled.control.applied(drawn[row], row, step - 1, agents, followed)
+        used, counts = np.unique(index[row], return_counts=True)
         deviations = means[used] - drawn[row].mean()
         variance[row], third[row] = _central(counts / counts.sum(), deviations, variances[used], thirds[used])
 
     def law(row: int) -> Law:
-        used, counts = np.unique(index[row, :, step - 1][:, agents], return_counts=True)
+        used, counts = np.unique(index[row], return_counts=True)
         return Law(counts / counts.sum(), parts.take(used))
 
     mean = drawn.mean(axis=1)

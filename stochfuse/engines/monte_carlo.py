@@ -20,6 +20,7 @@ import numpy as np
 
 from stochfuse.engines.events import ChanceEvent
 from stochfuse.engines.progress import listener, uncollected
+from stochfuse.errors import NoAnswerError
 from stochfuse.estimators.protocol import Claims, Estimator, Exchange, Late, StepOutcomes, Together
 from stochfuse.kalman.kernel import Estimate
 from stochfuse.scenario.system import Detection
@@ -87,11 +88,16 @@ class Sample(NamedTuple):
     Parameters
     ----------
     values : named tuple of arrays (values, …), the different ones.
-    which : (rows, runs, steps, agents) which of them each agent has.
+    which : (rows, runs, steps, agents) which of them each agent has, −1 at steps to which a run was not followed.
     """
 
     values: Any
     which: np.ndarray
+
+    def followed(self, step: int) -> np.ndarray | slice:
+        """Runs that were followed to a step, counted from 0: the same of every row."""
+        there = self.which[0, :, step, 0] >= 0
+        return slice(None) if there.all() else there
 
 
 def sample(experiment: Experiment, rows: int, *, workers: int = 1) -> Sample:
@@ -192,7 +198,11 @@ def _run_together(experiment: Experiment, blocks: Sequence[RunBlock]) -> tuple[A
             follows = experiment.together(some.stop - first)
             which = np.empty((some.stop - first, len(links), experiment.agents), np.int32)
             for step, now in enumerate(steps):
-                estimate, index = follows.exchange(of_runs(now, some, experiment.agents))
+                try:
+                    estimate, index = follows.exchange(of_runs(now, some, experiment.agents))
+                except NoAnswerError as error:
+                    before = block.number * size_of_block(experiment.agents) + first + 1
+                    raise NoAnswerError("".join(f"run {before + run}: " for run in error.items) + f"{error}") from None
                 parts.append(experiment.of(estimate))
                 which[:, step] = index + values
                 values += len(parts[-1][0])

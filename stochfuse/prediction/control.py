@@ -6,11 +6,12 @@ runs that carry the optimum alone.  Entry by entry of covariances, biases and st
 like agents,
 
     E[Y] ≈ 1/R Σ_r Y_r − β_(r) w (X_r − E[X])            w = 1        where E[X] is exact
-                                                         w = 1 − R/N  where it is the mean of the N − R further runs
+                                                         w = 1 − R/N  where it is that of the N − R further runs
 
 Of the optimum itself, sampled, X is a filter of the numbers heard (`stochfuse.engines.heard`), of known expectation for
-any network.  At step 1 the two are one.  Where nearly all that varies is taken away, what is left comes of outcomes so
-rare that a sample may not have met one: at later steps so much is added to the error, `UNMET`.
+any network; by it the mean of further runs is corrected, too.  At step 1 both are one.  Where nearly all that varies
+is taken away, what is left comes of outcomes so rare that a sample may not have met one: at later steps so much is
+added to the error, `UNMET`.
 
 The coefficient β_(r) = cov(Y, X)/var(X) is that of all blocks of runs but the one that r is in (splitting: Nelson 1990,
 Operations Research 38, 974; Avramidis and Wilson 1993, Operations Research Letters 14, 187).  So it is independent of
@@ -64,6 +65,8 @@ UNLIKELY = 5.0
 """Standard errors of the optimum's mean from its expectation that tell of outcomes that were not met."""
 UNMET = 0.004
 """What the numbers heard leave of an outcome too rare to be met, about, relative to the value; so rare: 1/runs."""
+LEFT = 0.01
+"""What they leave of the optimum's variance, about."""
 FLAT = 1e-12
 """Least eigenvalue of a covariance, scaled to unit variances, that is rounding."""
 MOST_NUMBERS, MOST_STATES, MOST_SETS = 20_000_000, 600, 8
@@ -91,18 +94,17 @@ class ControlExpectation(NamedTuple):
     bound : (rows, steps) proved relative half-width of it.
     further : the same of blocks of runs that carry the optimum alone, (rows, blocks, steps, agents, …), their mean the
         mean; None where it is known.
-    runs : how many further runs there are to every run.
+    runs : how many further runs there are.
     """
 
     mean: Moments
     bound: np.ndarray
     further: Moments | None = None
-    runs: float = 0.0
+    runs: int = 0
 
-    @property
-    def weight(self) -> float:
-        """How much of the difference of sample and expectation is corrected, w."""
-        return 1.0 if self.further is None else self.runs / (1.0 + self.runs)
+    def weight(self, runs: int) -> float:
+        """How much of the difference of so many runs' mean and the expectation is corrected, w."""
+        return 1.0 if self.further is None else self.runs / (self.runs + runs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,12 +120,15 @@ class Control:
     runs: Moments
     expected: ControlExpectation
 
-    def corrected(self, y: Moments, row: int, step: int, group: Sequence[int]) -> tuple[Moments, Moments | None]:
+    def corrected(
+        self, y: Moments, row: int, step: int, group: Sequence[int], followed: np.ndarray | slice
+    ) -> tuple[Moments, Moments | None]:
         """Terms of the sum, (runs, …), and what the further runs do to their mean, block by block, (blocks, …).
 
         Parameters
         ----------
-        y : what is asked for in every run, averaged over a group of agents, (runs, …).
+        y : what is asked for in every run followed to the step, averaged over a group of agents, (runs, …).
+        followed : these runs.
         """
         terms, moved, agents = [], [], list(group)
         further = self.expected.further or Moments(*(None,) * len(y))
@@ -132,23 +137,25 @@ class Control:
                 terms.append(m)
                 moved.append(m if m is None else 0.0 * m[:1])
                 continue
-            off = x[row, :, step][:, agents].mean(axis=1) - mean[row, step][agents].mean(axis=0)
-            β = coefficients(m, off)
-            corrected = m - self.expected.weight * β * off
+            off = x[row, followed, step][:, agents].mean(axis=1) - mean[row, step][agents].mean(axis=0)
+            β, weight = coefficients(m, off), self.expected.weight(len(m))
+            corrected = m - weight * β * off
             if _indefinite(corrected) and not _indefinite(m):
                 β, corrected = 0.0 * β, m
             terms.append(corrected)
             if more is not None:
                 blocks = more[row, :, step][:, agents].mean(axis=1)
-                moved.append(self.expected.weight * β.mean(axis=0) * (blocks - blocks.mean(axis=0)))
+                moved.append(weight * β.mean(axis=0) * (blocks - blocks.mean(axis=0)))
         return Moments(*terms), None if self.expected.further is None else Moments(*moved)
 
-    def applied(self, y: np.ndarray, row: int, step: int, group: Sequence[int]) -> np.ndarray:
+    def applied(
+        self, y: np.ndarray, row: int, step: int, group: Sequence[int], followed: np.ndarray | slice
+    ) -> np.ndarray:
         """Terms (runs,) of a number that every run has, corrected by the trace of the optimum; where that is exact."""
         if self.expected.further is not None:
             return y
         x, mean = (
-            np.trace(P, axis1=-2, axis2=-1) for P in (self.runs.P[row, :, step], self.expected.mean.P[row, step])
+            np.trace(P, axis1=-2, axis2=-1) for P in (self.runs.P[row, followed, step], self.expected.mean.P[row, step])
         )
         off = x[:, list(group)].mean(axis=1) - mean[list(group)].mean()
         return y - coefficients(y, off, 0.0) * off
@@ -245,8 +252,7 @@ class FollowedOptimum:
         found = self.expected
         if found is None or self.kind == KIND:
             return found
-        first = np.arange(found.bound.shape[1]) == 0  # where it is the optimum
-        return found._replace(bound=found.bound + np.where(first, 0.0, UNMET / runs))
+        return found._replace(bound=found.bound + _unmet(self._asked[0], runs))
 
     @cached_property
     def heard(self) -> Heard | None:
@@ -308,27 +314,55 @@ def expectation(system: System, links: LinkRows) -> ControlExpectation | None:
     return ControlExpectation(Moments(P, P, None, P) if system.error is None else Moments(P, P, b, M), found.bound)
 
 
-def estimated(system: System, links: LinkRows, how: Settings, correlation: float) -> ControlExpectation:
-    """Estimate the optimum's expectation from further runs that carry it alone.
+def estimated(
+    system: System, links: LinkRows, how: Settings, correlation: float, optimum: FollowedOptimum
+) -> ControlExpectation:
+    """Estimate the optimum's expectation from further runs that carry it alone, with the numbers heard as its control.
 
     Parameters
     ----------
     correlation : ρ² of the optimum and what is asked for, about.
+    optimum : what goes with the sample's own runs.
     """
     least, most = FURTHER
-    best = sqrt(COSTS[how.estimator not in SUMS] * correlation / max(1.0 - correlation, 1e-9)) - 1.0
+    left = 1.0 if optimum.heard is None else LEFT
+    best = sqrt(left * COSTS[how.estimator not in SUMS] * correlation / max(1.0 - correlation, 1e-9)) - 1.0
     further = min(max(best, least), most)
     runs = ceil(further * how.runs)
     numbers = len(links.link) * system.steps * system.agents * system.dimension**2
     size = max(2, min(size_of_block(system.agents), -(-runs // (2 * BLOCKS)), MOST_HELD // numbers))
     blocks = -(-runs // size)
     follow = partial(sample_optimum, system, links, size, how.seed, workers=how.workers)
-    found = [_mean(follow(first=SEPARATE + block)) for block in range(blocks)]
-    means = Moments(*(None if m[0] is None else np.stack(m, axis=1) for m in zip(*found, strict=True)))
-    bound = np.zeros((len(links.link), system.steps))
-    return ControlExpectation(means.map(lambda m: m.mean(axis=1)), bound, means, blocks * size / how.runs)
+    means, stand_in = [], []
+    for block in range(blocks):
+        drawn = follow(first=SEPARATE + block)
+        means.append(_mean(drawn.P, drawn.bias))
+        if optimum.heard is not None:
+            stand_in.append(_mean(*optimum.heard.of(drawn.heard)))
+    bound, means = np.zeros((len(links.link), system.steps)), _by_block(means)
+    if optimum.heard is not None:
+        bound += _unmet(system, blocks * size)
+        by_block = zip(means, _by_block(stand_in), optimum.heard.expected(), strict=True)
+        means = Moments(*(None if m is None else _corrected_blocks(m, x, mean) for m, x, mean in by_block))
+    return ControlExpectation(means.map(lambda m: m.mean(axis=1)), bound, means, blocks * size)
 
 
-def _mean(drawn: OptimumSample) -> Moments:
+def _mean(P: np.ndarray, bias: np.ndarray | None) -> Moments:
     """Mean moments of the optimum in some runs, (rows, steps, agents, …)."""
-    return Moments.of_optimum(drawn.P, drawn.bias).map(lambda m: m.mean(axis=1))
+    return Moments.of_optimum(P, bias).map(lambda m: m.mean(axis=1))
+
+
+def _by_block(found: Sequence[Moments]) -> Moments:
+    return Moments(*(None if m[0] is None else np.stack(m, axis=1) for m in zip(*found, strict=True)))
+
+
+def _corrected_blocks(m: np.ndarray, x: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """Means of blocks (rows, blocks, …), corrected by what stands in for them and its expectation (rows, …)."""
+    off = x - mean[:, None]
+    return np.stack([of_row - coefficients(of_row, by) * by for of_row, by in zip(m, off, strict=True)])
+
+
+def _unmet(system: System, runs: int) -> np.ndarray:
+    """How far, relatively, a mean corrected by the numbers heard may be off by what its runs did not meet, (steps,)."""
+    first = np.arange(system.steps) == 0  # where they say all
+    return np.where(first, 0.0, UNMET / runs)

@@ -7,7 +7,7 @@ through by the metric's derivative at the mean (delta method), taken by central 
 A control takes away what is common and leaves what is rare and skewed.  Of terms of skewness γ the mean over its own
 standard error s/√R is not standard normal: E[t] = −γ/(2√R), Var t = 1 + (2 + 7γ²/4)/R to first order (Hall 1992, The
 Bootstrap and Edgeworth Expansion, 2.6), though the mean itself is unbiased.  So a corrected sample's error is
-(1 + 2γ²/R)^½ s/√R, by which E[t²] is that of symmetric terms.
+(1 + 2(1 + γ²)/R)^½ s/√R, by which E[t²] is 1, of a few runs too.
 
 Wherever it helps, the exact optimum is the sample's control variate (`stochfuse.prediction.control`), and of the
 optimum of many agents itself a filter of the numbers heard.  How many runs a
@@ -105,12 +105,12 @@ class MomentSample:
         means = values.map(lambda m: np.empty((*shape, *m.shape[1:])))
         for row, step, g in np.ndindex(shape):
             if self.control is not None:
-                of_runs, _ = self.control.corrected(self.in_runs(values, row, step, g), row, step, self.groups[g])
+                of_runs, _ = self._corrected(self.in_runs(values, row, step, g), row, step, g)
                 for mean, each in zip(means, of_runs, strict=True):
                     if each is not None:
                         mean[row, step, g] = each.mean(axis=0)
                 continue
-            used, counts = np.unique(index[row, :, step][:, list(self.groups[g])], return_counts=True)
+            used, counts = np.unique(self._which(row, step, g), return_counts=True)
             for mean, each in zip(means, values, strict=True):
                 if each is not None:
                     mean[row, step, g] = np.tensordot(counts, each[used], axes=1) / counts.sum()
@@ -118,8 +118,16 @@ class MomentSample:
 
     def in_runs(self, values: Moments, row: int, step: int, group: int) -> Moments:
         """Moments in every run, as they were drawn, averaged over a group of agents, (runs, …)."""
-        which = self.sample.which[row, :, step][:, list(self.groups[group])]
+        which = self._which(row, step, group)
         return values.map(lambda m: m[which].mean(axis=1))
+
+    def _which(self, row: int, step: int, group: int) -> np.ndarray:
+        return self.sample.which[row, self.sample.followed(step), step][:, list(self.groups[group])]
+
+    def _corrected(self, y: Moments, row: int, step: int, group: int) -> tuple[Moments, Moments | None]:
+        if self.control is None:
+            return y, None
+        return self.control.corrected(y, row, step, self.groups[group], self.sample.followed(step))
 
     def standard_error(self, metric: Metric, groups: Sequence[int], quantity: str = "claimed") -> np.ndarray:
         """Standard error of a quantity of the mean over the agents of some groups, (rows, steps)."""
@@ -139,19 +147,15 @@ class MomentSample:
         share = np.array([len(self.groups[g]) for g in groups]) / sum(len(self.groups[g]) for g in groups)
         for row, step in np.ndindex(out.shape):
             plain = [self.in_runs(values, row, step, g) for g in groups]
-            drawn, terms, moved = _averaged(plain, share), plain, None
-            if self.control is not None:
-                both = [
-                    self.control.corrected(p, row, step, self.groups[g]) for p, g in zip(plain, groups, strict=True)
-                ]
-                terms = [of_runs for of_runs, _ in both]
-                moved = [more for _, more in both if more is not None]
-            terms = _averaged(terms, share)
+            drawn = _averaged(plain, share)
+            both = [self._corrected(p, row, step, g) for p, g in zip(plain, groups, strict=True)]
+            terms = _averaged([of_runs for of_runs, _ in both], share)
+            moved = [more for _, more in both if more is not None]
             mean = terms.map(lambda m: m.mean(axis=0))
             shown[row, step] = of(mean)
             variance, skewness = _spread(of, mean, terms.map(lambda m: m - m.mean(axis=0)))
             if self.control is not None:
-                variance *= 1.0 + 2.0 * skewness**2 / self.runs
+                variance *= 1.0 + 2.0 * (1.0 + skewness**2) / _runs(terms)
             error = np.sqrt(variance + (_spread(of, mean, _averaged(moved, share))[0] if moved else 0.0))
             constant, rounding = all(_constant(m) for m in drawn), ROUNDING * np.abs(shown[row, step])
             if constant or self.control is None:
@@ -169,17 +173,17 @@ class MomentSample:
 
     def scarce(self, row: int, step: int, group: int) -> bool:
         """Whether hardly any run is expected to have met anything but the likeliest, where there is anything else."""
-        return 0.0 < self.odds[row, step, group] * self.runs < SCARCE
+        return 0.0 < self.odds[row, step, group] * len(self._which(row, step, group)) < SCARCE
 
     def _unseen(self, of: Callable[[Moments], np.ndarray], mean: Moments, drawn: Moments) -> float:
         """Standard error of a value where hardly any run met anything but the likeliest."""
         if self.control is None or self.control.expected.further is not None:
-            return float(np.abs(of(mean))) / self.runs
+            return float(np.abs(of(mean))) / _runs(drawn)
         gap = float(np.abs(of(mean) - of(drawn.map(lambda m: m.mean(axis=0)))))
         return gap if gap > ROUNDING * np.abs(of(mean)) else 0.0
 
     def shown(self, system: System, what: ShownPart) -> tuple[np.ndarray, np.ndarray]:
-        """What will be looked at, and its standard errors, each (any,)."""
+        """What will be looked at, and its standard errors, each (any, steps that are looked at)."""
         metrics = what.metrics or (metric_of("trace", system.model),)
         everyone = range(len(self.groups))
         if what.agent == "mean":
@@ -188,7 +192,7 @@ class MomentSample:
             whom = [(g,) for g in everyone if isinstance(what.agent, str) or what.agent - 1 in self.groups[g]]
         steps = np.array(what.steps or range(1, system.steps + 1)) - 1
         found = [
-            np.stack(self.judged(m, groups, q))[:, :, steps].reshape(2, -1)
+            np.stack(self.judged(m, groups, q))[:, :, steps]
             for q in what.quantities
             for m in metrics
             for groups in whom
@@ -215,6 +219,10 @@ def _spread(of: Callable[[Moments], np.ndarray], mean: Moments, deviations: Mome
     slope = (above - below) / (2 * STEP)
     square = float((slope**2).mean())
     return square / (len(slope) - 1), float(((slope / np.sqrt(square)) ** 3).mean()) if square > 0 else 0.0
+
+
+def _runs(of_runs: Moments) -> int:
+    return len(next(m for m in of_runs if m is not None))
 
 
 def _constant(m: np.ndarray | None) -> bool:
@@ -273,32 +281,36 @@ def sampled(
     groups = groups_alike(network, links, kinds, permutations)
     odds = _odds(system, links, groups, how.estimator)
     optimum = FollowedOptimum(system, links, how)
+    dear = system.agents > FEW_TOGETHER and how.estimator == LFG
 
-    def draw(before: Sample | None, runs: int, first: int) -> Sample:
+    def draw(before: Sample | None, runs: int, first: int, upto: int = system.steps) -> Sample:
         now = replace(how, runs=runs)
         if how.estimator == OPTIMAL and network.agents > FEW:
             return _extended(before, _optimum(optimum, system, len(links.link), now, first, errors))
-        return _extended(before, _drawn(system, links, now, permutations, first=first, errors=errors))
+        return _extended(before, _drawn(system, links, now, permutations, first=first, errors=errors, upto=upto))
 
-    def judge(drawn: Sample, parts: Parts) -> tuple[tuple[MomentSample, str, Reduced], float]:
+    def judge(drawn: Sample, parts: Parts) -> tuple[tuple[MomentSample, str, Reduced], np.ndarray]:
         found = helped(system, links, how, MomentSample(drawn, groups, odds), parts, shown, optimum)
         values, error = found[0].shown(system, shown)
-        there = error > 0
         with np.errstate(divide="ignore"):  # no error but 0 is a share of 0
-            return found, float((error[there] / np.abs(values[there])).max()) if there.any() else 0.0
+            shares = np.divide(error, np.abs(values), out=np.zeros_like(error), where=error > 0).max(axis=0)
+        of_steps = np.zeros(system.steps)
+        of_steps[np.array(shown.steps or range(1, system.steps + 1)) - 1] = shares
+        return found, of_steps if dear else of_steps.max(keepdims=True)
 
     if how.precision is None:
         (found, said, control), _ = judge(draw(None, how.runs, 0), [(how.runs, 0)])
         return found, tuple(filter(None, (said, *rare(system, links, found)))), {"control": control._asdict()}
     numbers = len(links.link) * system.steps * system.agents
     most = min(MOST_NUMBERS // numbers, MOST_HELD // numbers // system.dimension**2)
-    dear = system.agents > FEW_TOGETHER and how.estimator == LFG
     first = max(FEWEST, min(FIRST, DEAR // system.agents**2)) if dear else FIRST
     limit = None if how.at_most is None else seconds(how.at_most)
     block = size_of_block(system.agents)
     (found, said, control), reached = sampled_to(share(how.precision), limit, (first, most), block, draw, judge)
     meta = {"control": control._asdict(), "precision": reached.for_programs}
     told = f"precision {100 * reached.reached:.2g} % of each value after {found.runs:,} runs"
+    whole = len(found.sample.which[0, found.sample.followed(-1)])
+    told += f" ({whole:,} of them to the last step)" if whole < found.runs else ""
     told += f", {100 * reached.asked:.3g} % asked for: {reached.stopped}" if reached.stopped else ""
     return found, tuple(filter(None, (told, said, *rare(system, links, found)))), meta
 
@@ -341,7 +353,7 @@ def helped(
     found = replace(plain, control=Control(runs, expected or own))
     reduction = _reduction(plain, found, system, shown)
     if expected is None and reduction >= WORTH:
-        expected = estimated(system, links, how, 1.0 - 1.0 / reduction)
+        expected = estimated(system, links, how, 1.0 - 1.0 / reduction, optimum)
         found = replace(plain, control=Control(runs, expected))
         reduction = _reduction(plain, found, system, shown)
     if reduction == 0.0:  # nothing is uncertain
@@ -351,7 +363,7 @@ def helped(
         why = f"the {optimum.kind} {takes} away too little of the variance (1/{reduction:.2f})"
         return plain, f"control: none; {why}", Reduced()
     mean = "exact" if expected.further is None else "estimated"
-    by = "" if mean == "exact" else f"; its mean from {expected.runs:.3g} times as many runs of its own"
+    by = "" if mean == "exact" else f"; its mean from {expected.runs / plain.runs:.3g} times as many runs of its own"
     told = f"1/{float(f'{reduction:.3g}'):,g}" if reduction < 1e6 else "less than a millionth"
     return (
         found,
@@ -410,7 +422,9 @@ def _extended(before: Sample | None, more: Sample) -> Sample:
         return more
     columns = zip(before.values, more.values, strict=True)
     values = type(more.values)(*(None if a is None else np.concatenate([a, b]) for a, b in columns))
-    return Sample(values, np.concatenate([before.which, more.which + len(before.values[0])], axis=1))
+    which = np.full((*more.which.shape[:2], *before.which.shape[2:]), -1, np.int32)
+    which[:, :, : more.which.shape[2]] = more.which + len(before.values[0])
+    return Sample(values, np.concatenate([before.which, which], axis=1))
 
 
 def states(system: System, links: LinkRows, how: Settings, records: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -465,16 +479,22 @@ def _drawn(
     first: int = 0,
     errors: bool = False,
     records: np.ndarray | None = None,
+    upto: int | None = None,
 ) -> Sample:
-    """Draw outcomes, and keep what is claimed in them, moments of the errors, or estimates given measurements."""
+    """Draw outcomes, and keep what is claimed in them, moments of the errors, or estimates given measurements.
+
+    Parameters
+    ----------
+    upto : last step that is followed, if not the system's.
+    """
     network, rows = system.network, len(links.link)
     how = replace(how, shown=ShownPart())  # metrics do not travel to other processes
     steps = range(1, network.steps + 1)
     drawn = [events(network, links, step) for step in (steps if links.varies else steps[:1])]
     experiment = Experiment(
         agents=network.agents,
-        events=drawn if links.varies else drawn * network.steps,
-        detections=[system.detections(step) if records is None else [] for step in steps],
+        events=(drawn if links.varies else drawn * network.steps)[:upto],
+        detections=[system.detections(step) if records is None else [] for step in steps[:upto]],
         make=partial(_made, system, how, permutations, errors, records),
         of=spread if records is not None else moments if errors else claimed_only,
         runs=how.runs,

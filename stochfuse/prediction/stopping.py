@@ -8,7 +8,8 @@ share s of a standard error in its value, and then
 
 runs in all, that the first stage's luck with its variance does not leave the second one short.  Where it does so all
 the same, or where R would be more than `GROWTH` times R_1, a further stage is fixed in the same way from all runs there
-are.  A limit of time looks at the clock, never at the values: the runs that fit are the answer.
+are.  A limit of time looks at the clock, never at the values: the runs that fit are the answer.  Where runs are dear, R
+is fixed for every step, and those that only early steps need end there.
 """
 
 from __future__ import annotations
@@ -18,10 +19,12 @@ from collections.abc import Callable
 from math import ceil, inf, isfinite
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from stochfuse.engines.monte_carlo import BLOCK
 from stochfuse.engines.progress import within
 
-FIRST, FEWEST = 400, 24
+FIRST, FEWEST = 400, 16
 """Most and fewest runs of the first stage."""
 GROWTH = 40
 """How many times as many runs a stage makes of those before."""
@@ -58,41 +61,41 @@ class _Drawing:
 
     Parameters
     ----------
-    draw : goes on with a sample (None at first), by so many runs, from a block of random numbers on.
+    draw : as for `sampled_to`.
     at_most : seconds, or None.
     block : runs that are drawn from one seed.
     said : what is drawn for, in words.
     """
 
-    def __init__(self, draw: Callable[[Any, int, int], Any], at_most: float | None, block: int, said: str) -> None:
+    def __init__(self, draw: Callable[..., Any], at_most: float | None, block: int, said: str) -> None:
         self.sample: Any = None
         self.parts: Parts = []
+        self.followed = np.zeros(1, dtype=int)  # runs so far, to every step
         self._draw, self._said, self._block, self._begun = draw, said, block, time.monotonic()
         self._end = inf if at_most is None else self._begun + at_most
 
-    @property
-    def runs(self) -> int:
-        """Runs so far."""
-        return sum(runs for runs, _ in self.parts)
-
-    def to(self, target: int) -> bool:
-        """Draw until there are so many runs; whether there was the time."""
-        missing = target - self.runs
-        while self.runs < target:
-            left, rest = self._end - time.monotonic(), target - self.runs
-            now = min(rest, max(BLOCK, -(-missing // PARTS)))
+    def to(self, targets: np.ndarray) -> bool:
+        """Draw until so many runs are followed to every step; whether there was the time."""
+        self.followed = np.broadcast_to(self.followed, targets.shape).copy()
+        pieces = -(-int((targets - self.followed).max()) // PARTS)
+        while len(short := np.flatnonzero(self.followed < targets)):
+            upto = int(short[-1]) + 1
+            left, rest = self._end - time.monotonic(), int((targets - self.followed)[upto - 1])
+            now = min(rest, max(BLOCK, pieces))
             if self.parts:
-                cost = (time.monotonic() - self._begun) / self.runs
+                cost = (time.monotonic() - self._begun) / self.followed.sum() * upto
                 now, left = min(now, int(min(left / cost, rest))), min(left, rest * cost)
                 if now < min(FEW, rest):
                     return False
             elif left < inf:
                 now = min(now, FEW)  # which show what a run takes
             told = f", about {left:.0f} s left" if self.parts else ""
-            with within(f"{self._said}{told}", self.runs + 1, target):
+            with within(f"{self._said}{told}", int(self.followed[0]) + 1, int(targets[0])):
                 first = sum(-(-runs // self._block) for runs, _ in self.parts)
-                self.sample = self._draw(self.sample, now, first)
+                whole = upto == len(targets)
+                self.sample = self._draw(self.sample, now, first, *(() if whole else (upto,)))
             self.parts.append((now, first))
+            self.followed[:upto] += now
         return True
 
 
@@ -101,8 +104,8 @@ def sampled_to(
     at_most: float | None,
     sizes: tuple[int, int],
     block: int,
-    draw: Callable[[Any, int, int], Any],
-    judge: Callable[[Any, Parts], tuple[Any, float]],
+    draw: Callable[..., Any],
+    judge: Callable[[Any, Parts], tuple[Any, np.ndarray]],
 ) -> tuple[Any, Reached]:
     """Draw until a precision is reached.
 
@@ -111,21 +114,32 @@ def sampled_to(
     asked, at_most : precision, and seconds or None.
     sizes : runs of the first stage, and runs that can be held.
     block : runs that are drawn from one seed.
-    draw : goes on with a sample (None at first), by so many runs, from a block of random numbers on.
-    judge : what a sample, of some parts, comes to, and its largest share of a standard error in its value.
+    draw : goes on with a sample (None at first), by so many runs, from a block of random numbers on, and, if they are
+        not to be followed to the end, up to a step.
+    judge : what a sample, of some parts, comes to, and its largest share of a standard error in its value: of every
+        step, or one for all, which are then followed to the end.
     """
     drawing, most = _Drawing(draw, at_most, block, f"to {100 * asked:.3g} % of every value"), sizes[1]
-    target = min(sizes)
+    targets = np.array([min(sizes)])
     while True:
-        in_time = drawing.to(target)
-        found, reached = judge(drawing.sample, drawing.parts)
+        in_time = drawing.to(targets)
+        found, shares = judge(drawing.sample, drawing.parts)
+        reached, followed = float(shares.max()), np.broadcast_to(drawing.followed, shares.shape)
         if reached <= asked:
             return found, Reached(asked, reached)
         if not in_time:
             return found, Reached(asked, reached, f"{at_most:g} s were over")
-        if target >= most:
+        if targets[0] >= most:
             return found, Reached(asked, reached, f"{most:,} runs are the most that are held")
-        target = min(most, stage(target, reached / asked))
+        wanted = [stage(n, s / asked) if s > asked else n for n, s in zip(followed.tolist(), shares, strict=True)]
+        targets = lengths(np.maximum(np.minimum(wanted, most), followed))
+
+
+def lengths(wanted: np.ndarray) -> np.ndarray:
+    """Runs that are followed to every step, where so many are wanted: of two lengths, and fewest steps in all."""
+    need, steps = np.maximum.accumulate(wanted[::-1])[::-1], np.arange(len(wanted))
+    early = int((need[0] * steps + need * (len(steps) - steps)).argmin())
+    return np.where(steps < early, need[0], need[early])
 
 
 def stage(runs: int, excess: float) -> int:

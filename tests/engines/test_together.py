@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
 from itertools import pairwise
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 import stochfuse as sf
 from stochfuse.engines import monte_carlo
 from stochfuse.engines.events import events
-from stochfuse.errors import TooManyError
+from stochfuse.errors import NoAnswerError, TooManyError
 from stochfuse.estimators import pedigrees, together
 from stochfuse.prediction import sampled
 from stochfuse.scenario.scenario import link_rows
@@ -176,3 +177,26 @@ def test_runs_of_many_agents_are_drawn_in_smaller_blocks(monkeypatch):
     monkeypatch.setattr(monte_carlo, "MOST_OF_BLOCK", 4)
     assert [b.size for b in monte_carlo.blocks_of(5, 8, 1)] == [1] * 5
     assert [(b.first, b.size) for b in monte_carlo.blocks_of(5, 4, 1)] == [(0, 3), (3, 2)]
+
+
+@pytest.mark.parametrize("R", [1, 100])
+def test_sets_that_meet_in_pairs_alone_leave_less_than_nothing(R):
+    """Four agents each know three starts, every two of them one in common: 4 (f(3) + 1/R) − 6 f(1), f brings forward."""
+    first, second = np.zeros((2, 7, 7))
+    for agent, heard in enumerate([[3, 4], [0, 5], [1, 4], [2, 5]]):
+        first[agent, heard] = 1
+    second[0, 1:4] = 1
+    source = {"model": {"F": 1, "H": 1, "Q": 9, "R": R}, "initial": {"P": 1}}
+    network = {"agents": 7, "steps": 2, "link": [first.tolist(), second.tolist()]}
+    given = sf.Scenario.from_mapping(source | {"network": network})
+    information = 4 * (1 / (Fraction(1, 3) + 9) + Fraction(1, R)) - 6 * 1 / (1 + Fraction(9))
+    if information > 0:
+        found = sf.predict(given, method="monte-carlo", runs=2).values(agent=1)[0, 1]
+        assert found == pytest.approx(float(1 / information), rel=1e-12)
+        return
+    assert information == Fraction(-23, 175)
+    message = (
+        "^run 1: at step 2 the information of agent 1 is not positive definite .the Local Fusion Graph's own answer"
+    )
+    with pytest.raises(NoAnswerError, match=message):
+        sf.predict(given, method="monte-carlo", runs=2)

@@ -13,7 +13,7 @@ from stochfuse.engines.events import events
 from stochfuse.engines.monte_carlo import Sample, draw_fates, stream
 from stochfuse.kalman.metrics import metric
 from stochfuse.prediction import control
-from stochfuse.prediction.method import ShownPart
+from stochfuse.prediction.method import Settings, ShownPart
 from stochfuse.scenario.scenario import link_rows
 from tests.agreement.test_detection import with_detection
 
@@ -140,6 +140,22 @@ def test_two_levels(monkeypatch):
     assert (np.abs(found.values() - exact) < 4.5 * found.standard_error()).all()
     again = drawn(scenario, link, quantity="actual", runs=150, workers=2)
     np.testing.assert_allclose(again.values(), found.values(), rtol=1e-12)
+
+
+def test_the_expectation_of_further_runs_is_corrected_by_the_numbers_heard(monkeypatch):
+    """Against the chain, which takes so few; and how much less is left uncertain than of as many runs alone."""
+    scenario = small({"agents": 5, "link": (0.8 * np.random.default_rng(1).random((5, 5))).tolist()})
+    rows, how = link_rows(scenario), Settings(runs=100, estimator="local-fusion-graph")
+    exact = control.expectation(scenario.system, rows)
+    optimum = control.FollowedOptimum(scenario.system, rows, how)
+    found = control.estimated(scenario.system, rows, how, 0.99, optimum)
+    monkeypatch.setattr(control.FollowedOptimum, "heard", None)
+    alone = control.estimated(scenario.system, rows, how, 0.99, control.FollowedOptimum(scenario.system, rows, how))
+    for known, mean, blocks, plain in zip(exact.mean, found.mean, found.further, alone.further, strict=True):
+        error, without = (each.std(axis=1, ddof=1) / np.sqrt(each.shape[1]) for each in (blocks, plain))
+        bound = found.bound[0, :, None, None, None] * np.abs(known)
+        assert (np.abs(mean - known) <= 4.5 * error + bound + 1e-12).all()
+        assert np.median(without[:, 1:] ** 2 * alone.runs / (error[:, 1:] ** 2 * found.runs)) > 10
 
 
 @pytest.mark.parametrize(("network", "link"), [({}, 0.2), ({"architecture": "cyclic"}, 0.9)])

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 import stochfuse as sf
 from stochfuse.kalman.metrics import metric
-from stochfuse.prediction import stopping
+from stochfuse.prediction import sampled, stopping
 from stochfuse.prediction.method import ShownPart, seconds, share
 from tests.cli.command import run, strict_json
 
@@ -23,6 +23,39 @@ def test_a_stage_is_as_long_as_the_first_stage_may_have_been_lucky(runs, excess)
 
 def test_a_stage_is_not_endless():
     assert stopping.stage(400, 1e6) == stopping.stage(400, np.inf) == 16_000
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_runs_of_two_lengths_follow_fewest_steps(seed):
+    """Against every way to follow some runs up to a step and the others to the end."""
+    rng = np.random.default_rng(seed)
+    wanted = rng.integers(5, 100, size=rng.integers(1, 9))
+    found = stopping.lengths(wanted)
+    ways = [np.where(np.arange(len(wanted)) < k, wanted.max(), wanted[k:].max()) for k in range(len(wanted))]
+    enough = [way for way in ways if (way >= wanted).all()]
+    assert any((found == way).all() for way in enough)
+    assert found.sum() == min(way.sum() for way in enough)
+
+
+def test_runs_that_only_early_steps_need_end_there(monkeypatch):
+    """What varies most is what is brought forward for the first time: against a sample of another seed."""
+    link = 0.55 * np.random.default_rng(2).random((8, 8)) * (1 - np.eye(8))
+    model = {"F": 1, "H": 1, "Q": 25, "R": 100}
+    network = {"agents": 8, "steps": 6, "link": link.tolist()}
+    scenario = sf.Scenario.from_mapping({"model": model, "initial": {"P": 100}, "network": network})
+    monkeypatch.setattr(sampled, "DEAR", 40 * 8**2)
+    found = sf.predict(scenario, None, "monte-carlo", precision=0.002, seed=2)
+    which = found.sampled.sample.which[0, :, :, 0]
+    followed = (which >= 0).sum(axis=0)
+    assert followed[0] == found.sampled.runs > followed[-1] >= 40
+    assert (np.diff(followed) <= 0).all()
+    assert f"({followed[-1]:,} of them to the last step)" in found.notes[0]
+    # followed to a step is followed to those before
+    assert (np.diff((which >= 0).astype(int), axis=1) <= 0).all()
+    assert (found.standard_error() <= 0.002 * found.values()).all()
+    plain = sf.predict(scenario, None, "monte-carlo", runs=800, seed=5)
+    z = (found.values() - plain.values()) / np.hypot(found.standard_error(), plain.standard_error())
+    assert np.abs(z).max() < 4.5
 
 
 @pytest.mark.parametrize(("value", "found"), [("0.2%", 0.002), (0.002, 0.002), ("0.002", 0.002), (" 5 % ", 0.05)])
