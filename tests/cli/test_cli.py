@@ -209,6 +209,26 @@ def test_each_agent_is_refused_where_there_is_no_column(words, message):
     assert run("predict", "--agent", "each", *words, code=2).stderr == f"error: {message}\n"
 
 
+@pytest.mark.parametrize(
+    ("own", "said"),
+    [
+        ("link = 0.3", None),
+        ("link = [0.3, 0.4]", "network.link (one per step)"),
+        ("link = [[0, 0.4], [1, 0]]", "network.link (a matrix)"),
+        ("link = [[[0, 0.4], [1, 0]], 0.5]", "network.link (a matrix per step)"),
+        ('link = { file = "nowhere.csv" }', "network.link (those of nowhere.csv)"),
+        ("link = 0.3\nburst = { good_to_bad = 0.1, bad_to_good = 0.5 }", "network.burst (bursts)"),
+        ("[network.radio]\ntransmit_power = 20", "network.radio (a link budget)"),
+    ],
+)
+def test_a_link_says_what_it_takes_the_place_of(own, said):
+    text = f"[model]\nF=1\nH=1\nQ=1\nR=1\n[initial]\nP=1\n[network]\nagents = 2\nsteps = 2\n{own}\n"
+    done = run("predict", "-", "--link", "0.6", "-f", "csv", input=text)
+    told = [line for line in done.stderr.splitlines() if "--link" in line]
+    assert told == [f"note: --link takes the place of the scenario's own links: {said}"] * (said is not None)
+    assert done.stdout == run("predict", "-", "--link", "0.6", "-f", "csv", input=text.replace(own, "")).stdout
+
+
 def test_scenario_from_standard_input_file_and_json(tmp_path):
     text = run("scenario", "show", "cv-2d").stdout
     (tmp_path / "mine.toml").write_text(text)
