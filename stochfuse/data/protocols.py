@@ -22,9 +22,9 @@ import numpy as np
 from stochfuse.data.agent import Agent
 from stochfuse.data.draw import drawn_arrivals
 from stochfuse.data.messages import MessageProtocol, encode
-from stochfuse.engines.progress import listener
 from stochfuse.engines.replay import ArrivalRecord
 from stochfuse.errors import UsageError
+from stochfuse.estimators.progress import listener
 from stochfuse.estimators.world import Footprints, World, world_of
 from stochfuse.kalman.metrics import Metric, Moments
 from stochfuse.prediction import quantities

@@ -19,7 +19,7 @@ from math import ceil, inf, isfinite
 from typing import Any, NamedTuple
 
 from stochfuse.engines.monte_carlo import BLOCK
-from stochfuse.engines.progress import within
+from stochfuse.estimators.progress import within
 
 FIRST, FEWEST = 400, 24
 """Most and fewest runs of the first stage."""
