@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 from stochfuse.cli.progress import quiet
-from stochfuse.cli.values import check_files, check_memory, named, over_values, parse_link, settings_for
+from stochfuse.cli.values import check_files, check_memory, named, over_values, parse_link, settings_for, tell
 from stochfuse.errors import UsageError, nearest
 from stochfuse.scenario import registry
 from stochfuse.scenario.registry import CONTROLS, CRITERIA, ESTIMATORS, METHODS, QUANTITIES
@@ -183,7 +183,9 @@ class Changes:
 
         links = None if self.link is None else parse_link(self.link)
         changed = {key: value for key, value in vars(self).items() if key != "link"}
-        return load_scenario(scenario, **changed, uniform_link=links is not None), links
+        given = load_scenario(scenario, **changed, uniform_link=links is not None)
+        tell([f"note: --link takes the place of the scenario's own links: {given.replaced}"] if given.replaced else [])
+        return given, links
 
     def swept(
         self, scenario: str, texts: Sequence[str] | None, kind: str

@@ -9,7 +9,6 @@ from stochfuse.cli.options import (
     PLACES,
     RARE,
     SHOWN,
-    AgentOption,
     AtOption,
     Averaging,
     Changes,
@@ -29,6 +28,8 @@ from stochfuse.scenario.registry import GENERAL, MONTE_CARLO, NAIVE, SIMPLIFIED,
 if TYPE_CHECKING:
     from stochfuse.report.predictions import PredictionView
 
+EACH = "each"
+"""All agents beside each other."""
 EXAMPLES = (
     "stochfuse predict --agents 50 --link 0:1:0.25 --steps 4",
     "stochfuse predict --method general --quantity claimed,actual --steps 3",
@@ -54,7 +55,10 @@ def predict(
             metavar="NAME",
         ),
     ] = "mean",
-    agent: AgentOption = None,
+    agent: Annotated[
+        str | None,
+        option("Whose: mean (the default), worst, best, a number or a name; or each.", SHOWN, metavar="N"),
+    ] = None,
     at: AtOption = None,
     normalise: Annotated[bool, option("Relative to link probability 0.", SHOWN + RARE, "--normalise")] = False,
     steady: Annotated[
@@ -76,7 +80,7 @@ def predict(
     from stochfuse.prediction.method import ShownPart
     from stochfuse.prediction.predict import predict_several as run
     from stochfuse.prediction.quantities import check
-    from stochfuse.report.predictions import PredictionView, report
+    from stochfuse.report.predictions import PredictionView, each_report, report
 
     to.check(scenario, measurements)
     several = {"--over": over, "--normalise": normalise, "--statistic": None if statistic == "mean" else statistic}
@@ -91,7 +95,12 @@ def predict(
         raise UsageError(f"--measurements: expected --quantity {STATE} to go with it, got {quantity}")
     quantities = quantity_names(quantity)
     given, links, swept = changes.swept(scenario, over, to.kind)
-    chosen_agent, steps = whose(agent, given), steps_at(at, given)
+    each = agent == EACH
+    chosen_agent, steps = EACH if each else whose(agent, given), steps_at(at, given)
+    if each and len(quantities) > 1:
+        raise UsageError(f"--agent {EACH}: expected one --quantity, got {quantity}")
+    if each and swept and len({s.network.agents for s in swept.scenarios}) > 1:
+        raise UsageError(f"--agent {EACH}: expected as many agents in every row, got --over {over[0] if over else ''}")
     chosen = metric_of(metric or given.metric or "trace", given.model)
     for name in quantities:
         check(name, chosen)
@@ -123,12 +132,12 @@ def predict(
     found = run(given, links, asked, quantities, **settings)
     at_zero = run(given, [0.0], asked, quantities, **settings) if normalise else [None] * len(found)
     views = tuple(
-        PredictionView(p, chosen, chosen_agent, baseline, to.digits, statistic, steps)
+        PredictionView(p, chosen, "mean" if each else chosen_agent, baseline, to.digits, statistic, steps)
         for p, baseline in zip(found, at_zero, strict=True)
     )
     for view in views:
         view.values()  # a request that cannot be met should say so before notes and figures
-    said, shown = tell(_said(views)), report(views)
+    said, shown = tell(_said(views)), each_report(views[0]) if each else report(views)
     to.write(shown)
     to.send(shown, given.to_mapping(), said)
 
@@ -160,9 +169,9 @@ def _states(
         raise UsageError("SCENARIO and --measurements: expected at most one of them on standard input, got - for both")
     given, links = changes.of(scenario)
     records = read_records(given, measurements)
+    if asked.agent in ("worst", "best", EACH):
+        raise UsageError(f"--agent: expected mean or a number with --quantity {STATE}, got {asked.agent}")
     agent, steps = whose(asked.agent, records.scenario), steps_at(asked.at, records.scenario)
-    if agent in ("worst", "best"):
-        raise UsageError(f"--agent: expected mean or a number with --quantity {STATE}, got {agent}")
     found = expected_states(records.scenario, records.one_run(), links, asked.method, **settings)
     said = tell(f"note: {note}" for note in records.notes)
     shown = states_report(StatesView(found, agent, steps, to.digits))

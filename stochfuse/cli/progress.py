@@ -14,7 +14,7 @@ from contextlib import contextmanager
 
 import typer
 
-from stochfuse.engines.progress import Progress, listening
+from stochfuse.estimators.progress import Progress, listening
 
 PATIENCE = 2.0
 """Seconds of work after which the user is told of it."""

@@ -14,8 +14,8 @@ import typer
 from stochfuse.cli.options import OUTPUT, SHOWN, WORK, Beside, choice, option
 from stochfuse.cli.progress import known_long, quiet
 from stochfuse.cli.values import named_once, refuse, tell
-from stochfuse.engines.progress import Progress, listener, listening
 from stochfuse.errors import UsageError
+from stochfuse.estimators.progress import Progress, listener, listening
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor

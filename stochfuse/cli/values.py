@@ -65,15 +65,7 @@ def whose(agent: str | None, scenario: Scenario) -> int | str:
     UsageError
         If there is no such agent.
     """
-    chosen = (scenario.agent or "mean") if agent is None else whole(agent) or agent
-    most, names = scenario.network.agents, scenario.network.names
-    if chosen in names:
-        return names.index(str(chosen)) + 1
-    if chosen not in ("mean", "worst", "best") and not (isinstance(chosen, int) and 1 <= chosen <= most):
-        named = f", or one of {', '.join(names)}" if names else ""
-        like = nearest(str(agent), names)
-        raise UsageError(f"agent: expected mean, worst, best or a number from 1 to {most}{named}, got '{agent}'{like}")
-    return chosen
+    return scenario.network.agent((scenario.agent or "mean") if agent is None else whole(agent) or agent)
 
 
 SAMPLED, LISTED, BOTH = (MONTE_CARLO,), (GENERAL, NAIVE), (GENERAL, MONTE_CARLO)

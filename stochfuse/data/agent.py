@@ -425,13 +425,7 @@ class Live:
 
 def _number(scenario: Scenario, agent: int | str) -> int:
     """Agent's number from 0."""
-    n, names = scenario.network.agents, scenario.network.names
-    if isinstance(agent, str) and agent in names:
-        return names.index(agent)
-    if isinstance(agent, int | np.integer) and not isinstance(agent, bool) and 1 <= agent <= n:
-        return int(agent) - 1
-    named = f", or {', '.join(names)}" if names else ""
-    raise UsageError(f"agent: expected a number from 1 to {n}{named}, got '{agent}'")
+    return int(scenario.network.agent(agent, ())) - 1
 
 
 def _told(world: World) -> str:

@@ -37,8 +37,8 @@ from stochfuse.data.fits import ROUNDING, Fit, Fits, Means, covariance_of
 from stochfuse.data.mistakes import DEPENDENT, MISTAKES, WRONG_LINK, Mistake, Variant
 from stochfuse.data.supposed import CLAIMED, ERROR, SQUARED, LinkMeans, Sampler, Simulator, exactly
 from stochfuse.engines.distribution import Distribution
-from stochfuse.engines.progress import listener
 from stochfuse.errors import StochfuseError
+from stochfuse.estimators.progress import listener
 from stochfuse.kalman.metrics import metric as metric_of
 from stochfuse.prediction.result import Prediction
 from stochfuse.scenario.network import LinkRows, uniform_rows

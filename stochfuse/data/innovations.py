@@ -36,6 +36,7 @@ class Supposition(NamedTuple):
     scale : by agent, (p,) by how much that is larger than what the record says.
     noise : by agent, (p,) factors of the variances R.
     process, start : factors of Q and P(k0).
+    motion : F and Q in the place of the model's, where agents track one state by a model that does not vary; or None.
     """
 
     z: tuple[np.ndarray, ...]
@@ -43,6 +44,7 @@ class Supposition(NamedTuple):
     noise: tuple[np.ndarray, ...]
     process: float = 1.0
     start: float = 1.0
+    motion: tuple[np.ndarray, np.ndarray] | None = None
 
     def with_agent(self, agent: int, **changed: np.ndarray) -> Supposition:
         """Return the case with another z, scale or noise of an agent, counted from 0."""
@@ -132,6 +134,12 @@ class _Filters:
         self.z = [np.stack([case.z[i] for case in cases]) for i in range(n)]
         self.noise = [np.sqrt(np.stack([case.noise[i] for case in cases]))[:, None] for i in range(n)]
         self.process = np.array([case.process for case in cases])[:, None, None, None]
+        self.moved = None
+        if any(case.motion is not None for case in cases):
+            rows = self.world.states[0]
+            told = at_step(self.world.F[0], 2), at_step(self.world.Q, 2)[rows, rows]
+            each = [told if case.motion is None else case.motion for case in cases]
+            self.moved = tuple(np.stack(matrices)[:, None] for matrices in zip(*each, strict=True))
         self.white = np.full((len(cases), runs, self.steps, n, p), np.nan)
         self.likelihood = np.zeros(len(cases))
         self.counts = np.zeros(len(cases))
@@ -158,9 +166,10 @@ class _Filters:
         for step in range(2, self.steps + 1):
             for agents in self.groups:
                 rows = self.world.states[agents[0]]
-                Q = at_step(self.world.Q, step)[rows, rows] * self.process
+                told = at_step(self.world.F[agents[0]], step), at_step(self.world.Q, step)[rows, rows]
+                F, Q = told if self.moved is None else self.moved
                 moved = at_step(self.setting.system.model.Bu, step)
-                estimate = predict(self.filters[agents[0]], at_step(self.world.F[agents[0]], step), Q, moved)
+                estimate = predict(self.filters[agents[0]], F, Q * self.process, moved)
                 if self.setting.truth is not None:
                     estimate = self._true(self.setting.truth, agents[0], step)
                 for agent in agents:

@@ -22,9 +22,9 @@ import numpy as np
 from stochfuse.data.agent import Agent
 from stochfuse.data.draw import drawn_arrivals
 from stochfuse.data.messages import MessageProtocol, encode
-from stochfuse.engines.progress import listener
 from stochfuse.engines.replay import ArrivalRecord
 from stochfuse.errors import UsageError
+from stochfuse.estimators.progress import listener
 from stochfuse.estimators.world import Footprints, World, world_of
 from stochfuse.kalman.metrics import Metric, Moments
 from stochfuse.prediction import quantities
@@ -134,12 +134,9 @@ class ProtocolLoad(Result):
         return _over_runs(value, self.runs)
 
     def _agents(self, agent: int | str) -> list[int]:
-        n = self.scenario.network.agents
-        if agent == "mean":
-            return list(range(n))
-        if isinstance(agent, int | np.integer) and 1 <= agent <= n:
-            return [int(agent) - 1]
-        raise UsageError(f"agent: expected mean or a number from 1 to {n}, got '{agent}'")
+        network = self.scenario.network
+        chosen = network.agent(agent, ("mean",))
+        return list(range(network.agents)) if isinstance(chosen, str) else [chosen - 1]
 
 
 def _over_runs(value: Callable[[np.ndarray], np.ndarray], runs: int) -> SampledLoad:

@@ -36,8 +36,8 @@ from stochfuse.data.robot_filters import (
     filtered,
 )
 from stochfuse.data.robots import RobotRecord, read_robots
-from stochfuse.engines.progress import listener
 from stochfuse.errors import UsageError, nearest
+from stochfuse.estimators.progress import listener
 from stochfuse.scenario import registry
 from stochfuse.scenario.result import Result
 from stochfuse.scenario.sensing import wrapped

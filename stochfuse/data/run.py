@@ -24,9 +24,9 @@ from stochfuse.data.consistency import Average, Series, band
 from stochfuse.data.draw import Draws, drawn_arrivals
 from stochfuse.data.records import ColumnNames, RecordedRuns, Records, read_records
 from stochfuse.data.suspicions import Suspicion, suspicions
-from stochfuse.engines.progress import listener
 from stochfuse.engines.replay import ArrivalRecord, Stage, moments_given, replay
 from stochfuse.errors import StochfuseError, UsageError, nearest
+from stochfuse.estimators.progress import listener
 from stochfuse.estimators.readings import Readings
 from stochfuse.kalman.kernel import Estimate
 from stochfuse.kalman.metrics import Metric

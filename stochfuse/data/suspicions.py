@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import combinations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import chdtri, ndtri
@@ -29,6 +29,8 @@ from scipy.special import chdtri, ndtri
 from stochfuse.data.consistency import Series
 from stochfuse.data.innovations import Innovations, InnovationSetting, Supposition, estimates, innovations, setting_of
 from stochfuse.data.records import RecordedRuns
+from stochfuse.errors import StochfuseError
+from stochfuse.scenario.over import with_numbers
 from stochfuse.scenario.scenario import Scenario
 from stochfuse.scenario.sensing import Instrument, parts_of
 from stochfuse.scenario.system import System
@@ -46,6 +48,8 @@ COMMON = {"Q-scaled": ("process", "process noise: a Q"), "P-scaled": ("start", "
 """Covariances that all agents have in common: factors of a `Supposition`, and what they are called."""
 SWALLOW = ("R-scaled", *COMMON)
 """What explains anything to some degree."""
+LIKE = {"step-length", "Q-scaled"}
+"""What may explain the same."""
 ROUNDS = 3
 """Suspicions told of a record at most."""
 HANGING, FAR, VERY_FAR = 3.0, 1.5, 5.0
@@ -57,6 +61,10 @@ FEW = 30
 """Pairs of steps below which autocorrelations are not looked at."""
 FACTORS = 10.0 ** (np.arange(-10, 11) / 2.0)
 """Factors of noises that are tried first."""
+LENGTHS = (0.001, 1.0 / 60.0, 0.1, 0.5, 2.0, 10.0, 60.0, 1000.0)
+"""How much longer steps may be than the scenario says."""
+COUPLED = 4
+"""States up to which entries of F are suspected."""
 FACTOR, BIAS = 1.4, 0.3
 """Least factor of a noise, and least bias in its deviations, that are told."""
 
@@ -245,16 +253,22 @@ def _best(
     both = [(each, found, i) for of, found in ((tried, first), (more, second)) for i, each in enumerate(of, start=1)]
     number = max(1, int((~np.isnan(trial.now.white)).sum()))
     base = trial.now.likelihood[0]
-    best, most = None, 2.0 * MARGIN
+    gains = []
     for each, found, i in both:
         if not each.name or each.name in without or (alone and each.agent is None and each.name != "bias"):
             continue
         value = found.likelihood[i]
         gain = np.inf if not np.isfinite(base) and np.isfinite(value) else 2.0 * (value - base)
         gain -= each.fitted * np.log(number)
-        if gain > most:
-            best, most = (each, found.of(i)), gain
-    return best
+        gains.append((gain, each, found, i))
+    gain, best, found, i = max(gains, key=lambda one: one[0], default=(-np.inf, None, first, 0))
+    if best is None or gain <= 2.0 * MARGIN:
+        return None
+    # what is seen of places alone tells longer steps hardly from more noise
+    like = [one for one in gains if one[0] > gain - 2.0 * MARGIN and {one[1].name, best.name} == LIKE]
+    if like:
+        best = best._replace(text=f"{best.text}, or {max(like, key=lambda one: one[0])[1].text},")
+    return best, found.of(i)
 
 
 def _of_truth(trial: _CaseSuspicions, truth: np.ndarray, known: np.ndarray) -> list[Suspicion]:
@@ -416,6 +430,39 @@ class _CaseSuspicions:
         for factor in FACTORS[FACTORS != 1.0]:
             for name in COMMON:
                 yield self._scaled_common(name, factor)
+        model, system = self.scenario.model, self.setting.system
+        if system.one_state and not model.varies and self.case.motion is None and self.setting.truth is None:
+            yield from self._step_lengths()
+            if model.dimension <= COUPLED:
+                for i, j in np.argwhere(model.F == 0.0) if model.dimension > 1 else ():
+                    yield from (self._coupled(i, j, sign * f) for f in FACTORS[6:13] for sign in (-1.0, 1.0))
+
+    def _step_lengths(self) -> Iterator[FittedCase]:
+        """Steps of another length: by the kind of motion, or by the matrix that F is the exponential of."""
+        from scipy.linalg import expm, logm
+
+        source = self.scenario.source.get("model", {})
+        step = source.get("step", 1.0)
+        for times in LENGTHS:
+            try:
+                if "kind" in source:
+                    model = with_numbers(self.scenario, {"model.step": times * step}).model
+                    F, Q = model.F, model.Q
+                else:
+                    root: Any = logm(self.scenario.model.F)
+                    F, Q = expm(times * root), self.scenario.model.Q
+            except (StochfuseError, TypeError, ValueError):
+                return
+            if np.isfinite(F).all() and not np.iscomplexobj(F) and not np.allclose(F, self.scenario.model.F):
+                text = f"the motion: steps {times:.3g} times as long as the scenario's"
+                yield FittedCase("step-length", None, text, self.case._replace(motion=(F, Q)))
+
+    def _coupled(self, i: int, j: int, value: float) -> FittedCase:
+        """An entry of F that is 0 in the scenario."""
+        F, states = self.scenario.model.F.copy(), self.scenario.model.states
+        F[i, j] = value
+        text = f"the motion: {value:.2g} {states[j]} that goes into {states[i]} in every step (model.F)"
+        return FittedCase("coupling", None, text, self.case._replace(motion=(F, self.scenario.model.Q)), 1)
 
     def _who(self) -> Iterator[Sequence[int]]:
         yield from ([i] for i in self.agents)
@@ -522,6 +569,11 @@ class _CaseSuspicions:
         for name in COMMON:
             for factor in self._between(name, None, tried, found):
                 yield self._scaled_common(name, factor)
+        coupled = [(found.likelihood[i], each.case) for i, each in enumerate(tried, start=1) if each.name == "coupling"]
+        motion = max(coupled, key=lambda each: each[0])[1].motion if coupled else None
+        if motion is not None:
+            ((i, j),) = np.argwhere(motion[0] != self.scenario.model.F)
+            yield from (self._coupled(i, j, motion[0][i, j] * 10.0 ** (n / 24.0)) for n in range(-6, 7))
 
     def _biased(self, who: Sequence[int], tried: Sequence[FittedCase], found: Innovations) -> Iterator[FittedCase]:
         """Biases of an agent, or of all alike, that make innovations least."""

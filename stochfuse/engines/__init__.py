@@ -7,7 +7,6 @@
     monte_carlo     outcomes drawn
 
 `events` has what may arrive in a step and how likely it is, `distribution` what can be asked of values with
-probabilities, `precision` how far rounding reaches, `progress` what long work says.  Engines take a system's
-numbers and events, never a scenario.  A new chance event is one more kind in `events`; a new engine one file and
-its method in `stochfuse.prediction`.
+probabilities, `precision` how far rounding reaches.  Engines take a system's numbers and events, never a scenario.  A
+new chance event is one more kind in `events`; a new engine one file and its method in `stochfuse.prediction`.
 """

@@ -59,8 +59,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.engines.events import alike
-from stochfuse.engines.progress import listener
 from stochfuse.errors import UsageError
+from stochfuse.estimators.progress import listener
 from stochfuse.kalman.algebra import NUMPY
 from stochfuse.kalman.kernel import (
     AsTheyAre,

@@ -43,7 +43,7 @@ from stochfuse.engines.monte_carlo import (
     stream,
 )
 from stochfuse.engines.precision import suspects
-from stochfuse.engines.progress import listener
+from stochfuse.estimators.progress import listener
 from stochfuse.estimators.protocol import StepOutcomes
 from stochfuse.kalman.kernel import Estimate, from_factor, taken_in
 from stochfuse.scenario.network import LinkRows

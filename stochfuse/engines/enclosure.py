@@ -39,7 +39,7 @@ from stochfuse.engines.contact_chain import (
     leading,
     transitions,
 )
-from stochfuse.engines.progress import listener
+from stochfuse.estimators.progress import listener
 from stochfuse.kalman.kernel import factor, from_factor
 
 GRID = 800

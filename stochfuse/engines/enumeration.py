@@ -31,9 +31,9 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from stochfuse.engines.events import ChanceEvent, Outcome, Rows, Weights, concerning, number_of_outcomes, outcomes
-from stochfuse.engines.progress import listener, uncollected
 from stochfuse.errors import TooManyError
 from stochfuse.estimators.ledger import different, numbered
+from stochfuse.estimators.progress import listener, uncollected
 from stochfuse.estimators.protocol import AdditiveEstimator, Estimator
 from stochfuse.scenario.system import Detection
 

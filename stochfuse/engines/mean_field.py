@@ -19,7 +19,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from stochfuse.engines.progress import listener
+from stochfuse.estimators.progress import listener
 from stochfuse.kalman.arrivals import Arrivals, nobody_else
 from stochfuse.kalman.averaged_update import update_measurement_space, update_scalar
 from stochfuse.kalman.kernel import (

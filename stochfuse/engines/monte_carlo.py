@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.engines.events import ChanceEvent
-from stochfuse.engines.progress import listener, uncollected
 from stochfuse.errors import NoAnswerError
+from stochfuse.estimators.progress import listener, uncollected
 from stochfuse.estimators.protocol import Claims, Estimator, Exchange, Late, StepOutcomes, Together
 from stochfuse.kalman.kernel import Estimate
 from stochfuse.scenario.system import Detection
@@ -238,6 +238,7 @@ def _run_blocks(experiment: Experiment, blocks: Sequence[RunBlock]) -> tuple[Any
     exchanges, exchange_of = [estimator.exchange(estimator.start())], np.zeros(runs, dtype=np.int64)
     place_of = np.tile(np.arange(experiment.agents), (runs, 1))
     for step in range(1, len(experiment.events) + 1):
+        listener().advance("histories", step, len(experiment.events))
         events = experiment.events[step - 1]
         fates = _moved(np.concatenate([fates[step - 1] for fates, _ in drawn]), events, place_of)
         # what is measured at the next step is drawn with what arrives at this one
@@ -262,6 +263,7 @@ def _kept(experiment: Experiment, claims: Claims, claimed: np.ndarray) -> Any:
     """What is kept of every value claimed by some run, in the order of the values."""
     parts, order = [], []
     for step in range(1, claimed.shape[1] + 1):
+        listener().advance("estimates", step, claimed.shape[1])
         values = np.unique(claimed[:, step - 1])
         parts.append(experiment.of(claims.estimate([(1, values)], step)[0]))
         order.append(values)

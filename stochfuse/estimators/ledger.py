@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from stochfuse.errors import NoAnswerError, UsageError
+from stochfuse.estimators.progress import listener
 from stochfuse.kalman.algebra import NUMPY, Algebra
 from stochfuse.kalman.kernel import (
     Estimate,
@@ -417,6 +418,7 @@ def evaluate(ledger: Ledger, sources: Sources) -> Information:
     atoms, value_step = evaluate_atoms(ledger.atoms, sources, total), np.array(ledger.step)
     values = np.empty((len(ledger.sums), *atoms.shape[1:]))
     for step in np.unique(value_step):
+        listener().advance("estimates", int(step), int(value_step.max()))
         here = np.flatnonzero(value_step == step)
         values[here] = total(here, atoms)
     return unpacked(values, sources)
@@ -444,6 +446,7 @@ def evaluate_atoms(
     of, atom_step = np.array([of for _, _, of in atoms]), np.array([step for _, step, _ in atoms])
     prior = np.array([kind == PRIOR for kind, _, _ in atoms])
     for step in range(1, int(atom_step.max()) + 1):
+        listener().advance("information", step, int(atom_step.max()))
         brought = np.flatnonzero(prior & (atom_step == step))
         if len(brought):
             out[brought] = brought_forward(total(of[brought], out), sources, step)

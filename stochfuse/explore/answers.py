@@ -2,7 +2,7 @@
 
 Answers are the command line's: `predict`, `compare`, `solve --target`, `solve --sensitivity` and `messages`, read by
 the views that print its tables.  `Work` follows one question at a time in a thread of its own; when the next is asked,
-the one before ends at its next sign of life (`stochfuse.engines.progress`), and what it still says is dropped.
+the one before ends at its next sign of life (`stochfuse.estimators.progress`), and what it still says is dropped.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stochfuse.engines.progress import Progress, listening
 from stochfuse.errors import StochfuseError, TooManyError
+from stochfuse.estimators.progress import Progress, listening
 from stochfuse.explore.network import Picture, picture
 from stochfuse.explore.state import COARSE, FINE, POWER, ROUGH, RUNS, PageInput, links_of
 from stochfuse.prediction.compare import compare_estimators
@@ -25,10 +25,12 @@ from stochfuse.questions.least_link import least_link
 from stochfuse.questions.messages import RULES, message_load
 from stochfuse.questions.sensitivity import sensitivity
 from stochfuse.report.predictions import WIDTH_95, PredictionView
-from stochfuse.scenario.registry import GENERAL, MONTE_CARLO, OPTIMAL, SIMPLIFIED
+from stochfuse.scenario.registry import GENERAL, MONTE_CARLO, NO_CONTROL, OPTIMAL, SIMPLIFIED
 from stochfuse.scenario.scenario import Scenario
 
 LEVEL = 0.95
+FIRST_RUNS = 20
+"""Runs of a sample that is there soon."""
 EVERY = 0.4
 """Seconds between what is said of how far it is."""
 AT_ONCE = threading.Semaphore(2)
@@ -100,11 +102,19 @@ def least(asked: PageInput) -> Iterator[tuple[str, Callable[[], Any]]]:
 
 
 def exact(asked: PageInput) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """Questions whose answers may take their time."""
+    """Questions whose answers may take their time; of what has to be sampled a few runs first, with wide bands."""
+    if _sampled(asked.scenario, [asked.link] if asked.kind == "link" else None):
+        for name in asked.estimators:
+            yield f"estimator {name}", lambda name=name: _estimated(asked, name, runs=FIRST_RUNS, control=NO_CONTROL)
     yield OPTIMAL, lambda: _predicted(asked, OPTIMAL)
     yield "messages", lambda: _load(asked)
     for name in asked.estimators:
-        yield f"estimator {name}", lambda name=name: _estimated(asked, name)
+        yield f"estimator {name}", lambda name=name: _estimated(asked, name, runs=RUNS)
+
+
+def _sampled(scenario: Scenario, links: Any) -> bool:
+    """Whether the outcomes of an exchange are too many to be listed unasked."""
+    return exchange_of(scenario, links) > EASY_EXCHANGE
 
 
 def _predicted(asked: PageInput, method: str) -> list[Curve]:
@@ -119,13 +129,13 @@ def _predicted(asked: PageInput, method: str) -> list[Curve]:
     return _curves(asked, method, ("claimed",), FINE, at)
 
 
-def _estimated(asked: PageInput, name: str) -> list[Curve]:
+def _estimated(asked: PageInput, name: str, **drawn: Any) -> list[Curve]:
     """As `compare` does it unasked: exactly where that is easy, else sampled, by fewer runs and links."""
 
     def by(method: str, **settings: Any) -> Callable[..., list[Any]]:
         def at(scenario: Scenario, links: Any, over: Any, alone: bool) -> list[Any]:
             asks = {"quantities": asked.quantities, **settings, **({"over": over} if over else {})}
-            if method == GENERAL and exchange_of(scenario, links) > EASY_EXCHANGE:
+            if method == GENERAL and _sampled(scenario, links):
                 raise TooManyError
             found = compare_estimators(scenario, links, [name], method, **asks)
             return [found.predictions[0].shown_as(quantity) for quantity in asked.quantities]
@@ -136,7 +146,7 @@ def _estimated(asked: PageInput, name: str) -> list[Curve]:
         return _curves(asked, name, asked.quantities, COARSE, by(GENERAL, max_graphs=EASY))
     except TooManyError:
         # in this process, where it can be given up
-        return _curves(asked, name, asked.quantities, ROUGH, by(MONTE_CARLO, runs=RUNS, workers=1))
+        return _curves(asked, name, asked.quantities, ROUGH, by(MONTE_CARLO, workers=1, **drawn))
 
 
 def _curves(

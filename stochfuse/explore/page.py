@@ -39,6 +39,7 @@ from stochfuse.explore.charts import DARK, LIGHT, Chart, NetworkChart, key_of
 from stochfuse.explore.network import Picture
 from stochfuse.explore.saved import PageContents, axes_of, lines_of
 from stochfuse.explore.state import OpenedScenario, PageInput, field_of
+from stochfuse.scenario.network import WHOSE
 from stochfuse.scenario.registry import ESTIMATORS, LFG, SIMPLIFIED
 from stochfuse.scenario.scenario import preset_names
 
@@ -49,7 +50,6 @@ MOST_LOGS = 8
 WAIT = 30
 """Milliseconds that pass before a change is followed, in which others may come."""
 OWN, ALIKE = "the scenario's own", "all alike, µ below"
-WHOSE = ("mean", "worst", "best")
 QUANTITIES = ("claimed,actual", "claimed", "actual", "consistency", "bias", "rms")
 HERE = Path(__file__).parent
 
@@ -252,10 +252,8 @@ class Page:
             metric=f["metric"].value.strip() or None,
             agent=int(f["agent"].value) if f["agent"].value.isdecimal() else f["agent"].value,
         )
-        n = asked.scenario.network.agents
+        asked.scenario.network.agent(asked.agent)
         asked.measure  # noqa: B018  says what is wrong with a name
-        if isinstance(asked.agent, int) and asked.agent > n:
-            raise UsageError(f"agent: expected mean, worst, best or a number from 1 to {n}, got '{asked.agent}'")
         if asked.target is not None and asked.target < 0:
             raise UsageError(f"target: expected a finite number of at least 0, got {asked.target:g}")
         return asked

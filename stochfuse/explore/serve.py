@@ -16,6 +16,8 @@ from stochfuse.explore.state import MOST_BYTES, OpenedScenario
 
 FIRST_PORT, PORTS = 5006, 10
 LOOPBACK = "127.0.0.1"
+PING = 20
+"""Seconds between signs of life, to pages and to what stands between."""
 
 
 def serve(given: OpenedScenario, port: int | None, address: str, started: Callable[[str], Any]) -> None:
@@ -51,10 +53,13 @@ def serve(given: OpenedScenario, port: int | None, address: str, started: Callab
         address=address,
         allow_websocket_origin=[f"{name}:{chosen}" for name in sorted(names)],
         websocket_max_message_size=2 * MOST_BYTES,
-        keep_alive_milliseconds=10_000,
+        keep_alive_milliseconds=0,
         check_unused_sessions_milliseconds=5_000,
         unused_session_lifetime_milliseconds=30_000,
     )
+    # Bokeh's own pings give a connection up that has just closed, and its `WSHandler.on_close` then fails on it
+    # (AssertionError in `ServerConnection.session`); Tornado's know of one another, and of pongs that do not come
+    server._tornado.settings["websocket_ping_interval"] = PING
     sys.setswitchinterval(0.001)  # so that a page is answered while engines work beside it
     server.start()
     started(f"http://{address}:{chosen}/")

@@ -36,10 +36,10 @@ from stochfuse.engines.events import (
     weights_for,
 )
 from stochfuse.engines.precision import NO_DIGIT, PROMISED, MovedSources, change, moved_claims, notes, reach, suspects
-from stochfuse.engines.progress import listener
 from stochfuse.errors import NoAnswerError, StochfuseError, TooManyError, UsageError
 from stochfuse.estimators.ledger import InformationClaims, evaluate
 from stochfuse.estimators.making import kinds_of, make, sources
+from stochfuse.estimators.progress import listener
 from stochfuse.estimators.protocol import Claims, Made
 from stochfuse.estimators.world import claimed_only, moments
 from stochfuse.kalman.kernel import Estimate

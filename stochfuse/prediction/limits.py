@@ -35,8 +35,8 @@ from stochfuse.engines.contact_chain import (
 )
 from stochfuse.engines.enclosure import ROUNDING, enclosed, half_width
 from stochfuse.engines.precision import PROMISED
-from stochfuse.engines.progress import listener, within
 from stochfuse.errors import NoAnswerError, ScenarioError, StochfuseError, UsageError
+from stochfuse.estimators.progress import listener, within
 from stochfuse.kalman.metrics import Moments
 from stochfuse.prediction import optimal
 from stochfuse.prediction.method import Settings, group_of

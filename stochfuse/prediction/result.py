@@ -196,9 +196,7 @@ class Prediction(Result):
         return None if ends is None else ends[1]
 
     def _group(self, agent: int | str) -> int:
-        if isinstance(agent, int | np.integer) and 1 <= agent <= len(self.group_of):
-            return int(self.group_of[agent - 1])
-        raise UsageError(f"agent: expected mean, worst, best or a number from 1 to {len(self.group_of)}, got '{agent}'")
+        return int(self.group_of[int(self.scenario.network.agent(agent)) - 1])
 
     @property
     def steady(self) -> np.ndarray | None:

@@ -23,8 +23,8 @@ from typing import NamedTuple
 import numpy as np
 
 from stochfuse.engines.mean_field import CANCELLATION, Case, Form, MeasurementSpace, SquareRoot, UnlikeCase
-from stochfuse.engines.progress import listener
 from stochfuse.errors import NoAnswerError, UsageError
+from stochfuse.estimators.progress import listener
 from stochfuse.kalman.packed import basis, triangle
 from stochfuse.prediction import simplified
 from stochfuse.prediction.boundedness import decide, growing, growing_mode, hidden_mode, recursions

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stochfuse.engines.monte_carlo import BLOCK
-from stochfuse.engines.progress import within
+from stochfuse.estimators.progress import within
 
 FIRST, FEWEST = 400, 16
 """Most and fewest runs of the first stage."""

@@ -15,8 +15,8 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 
 import stochfuse
-from stochfuse.engines.progress import within
 from stochfuse.errors import UsageError
+from stochfuse.estimators.progress import within
 from stochfuse.kalman.metrics import Metric
 from stochfuse.prediction.result import Prediction
 from stochfuse.scenario.over import Over

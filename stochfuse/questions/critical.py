@@ -148,16 +148,13 @@ def critical(
     >>> round(sf.critical(remote).critical, 9)
     0.36
     """
-    agents = scenario.network.agents
-    numbered = isinstance(agent, int) and not isinstance(agent, bool) and 1 <= agent <= agents
-    if not numbered and agent not in ("mean", "worst", "best"):
-        raise UsageError(f"agent: expected mean, worst, best or a number from 1 to {agents}, got {agent!r}")
+    agent = scenario.network.agent(agent)
     if parameter is None:
         at = _ReceiverChances(scenario).at
     else:
         sweep = parameter
         at = lambda x: _of(sweep(x), None)  # noqa: E731
-    receivers = [r for r, _ in at(0.5) if not numbered or agent in r]
+    receivers = [r for r, _ in at(0.5) if isinstance(agent, str) or agent in r]
     asked = [_BoundSearch(at, name, [r]) for r in receivers] if agent == "best" else [_BoundSearch(at, name, receivers)]
     found, lost = [], []
     for one in asked:

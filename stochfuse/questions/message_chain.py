@@ -26,6 +26,7 @@ import numpy as np
 
 from stochfuse.engines.events import ChanceEvent, concerning
 from stochfuse.errors import UsageError
+from stochfuse.estimators.progress import listener
 from stochfuse.kalman.arrivals import poisson_binomial
 from stochfuse.scenario.network import LinkRows, Network, number_of_senders, possible_senders
 
@@ -120,6 +121,7 @@ class _Walk:
         mass[:, places, gaps[places]] = weights.T
         yield mass.sum(axis=1)
         for step in range(last - 1, 0, -1):
+            listener().advance("message load", last - step, last)
             moved = np.matmul(self.transitions[self._drawn_at(step)], mass)
             mass = np.zeros_like(moved)
             for gap in np.unique(gaps):

@@ -146,12 +146,9 @@ class MessageLoad(Result):
         return self.probabilities.shape[2] == 1
 
     def _agents(self, agent: int | str) -> list[int]:
-        n = len(self.group_of)
-        if agent == "mean":
-            return list(range(n))
-        if isinstance(agent, int | np.integer) and 1 <= agent <= n:
-            return [int(agent) - 1]
-        raise UsageError(f"agent: expected mean or a number from 1 to {n}, got '{agent}'")
+        network = self.scenario.network
+        chosen = network.agent(agent, ("mean",))
+        return list(range(network.agents)) if isinstance(chosen, str) else [chosen - 1]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

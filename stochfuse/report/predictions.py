@@ -30,6 +30,8 @@ from stochfuse.report.plot import (
     direct,
     entry,
     labelled,
+    shades,
+    spread,
     titled,
     wrapped,
 )
@@ -325,6 +327,12 @@ def plus_minus(error: float, value: float) -> str:
 
 def predict_csv(view: PredictionView) -> str:
     """One line per link probability and step, with everything that says what the value is."""
+    headings, rows, _ = _records(view)
+    return to_csv(headings, rows)
+
+
+def _records(view: PredictionView) -> tuple[tuple[str, ...], list[tuple[Any, ...]], int]:
+    """Headings and cells of a CSV, and how many of the last ones are the value and its error."""
     p = view.prediction
     values, errors, steady = view.values(), view.errors(), view.steady()
     metric = view.metric.name + ("/at-link-0" if view.baseline else "")
@@ -347,7 +355,7 @@ def predict_csv(view: PredictionView) -> str:
             error = (None if ends is not None or steady_error is None else float(steady_error[i]) for _ in more)
             rows.append((*labels[:3], natures[i], *labels[4:], *record, "steady", float(steady[i]), *error))
     what = ("method", "quantity", "stage", "nature", "metric", "unit", "agent")
-    return to_csv((*what, *view.rows.headings, "step", "value", *more), rows)
+    return (*what, *view.rows.headings, "step", "value", *more), rows, 1 + len(more)
 
 
 def predict_json(view: PredictionView) -> dict[str, Any]:
@@ -413,12 +421,60 @@ def _steady_json(view: PredictionView, steady: np.ndarray) -> dict[str, Any]:
     return found
 
 
+def each_report(view: PredictionView) -> Report:
+    """Return one quantity of all agents beside each other; `view` is of their mean, which JSON has too."""
+    named, n = view.prediction.scenario.network.names, view.rows.sizes[0]
+    names = named or tuple(f"agent {i}" for i in range(1, n + 1))
+    views = [replace(view, agent=i) for i in range(1, n + 1)]
+    titles = (view.what, replace(view, agent="each").whom, view.how)
+
+    def csv() -> str:
+        (headings, rows, last), *others = map(_records, views)
+        kept = [i for i, heading in enumerate(headings[:-last]) if heading != "agent"]
+        beside = [name if heading == "value" else f"{name} {heading}" for name in names for heading in headings[-last:]]
+        cells = (
+            [*(each[0][i] for i in kept), *(cell for row in each for cell in row[-last:])]
+            for each in zip(rows, *(more for _, more, _ in others), strict=True)
+        )
+        return to_csv([*(headings[i] for i in kept), *beside], cells)
+
+    def json() -> dict[str, Any]:
+        each = zip(named or range(1, n + 1), views, strict=True)
+        agents = [{"agent": name, **_numbers(predict_json(one))} for name, one in each]
+        return {**predict_json(view), "agents": agents}
+
+    return Report(lambda: _beside(views, titles, names), csv, json, lambda: _draw_each(views, titles, names))
+
+
+def _draw_each(views: Sequence[PredictionView], titles: Sequence[str], names: Sequence[str]) -> Any:
+    """Return the figure: a curve for each agent, at the last step, or against the steps where rows are no sequence."""
+    curves, figure = views[0].rows.curves(views[0].steps, last=True), canvas(7.5, 5.4)
+    axes, chosen, handles = figure.add_subplot(), spread(len(views)), []
+    for color, i in zip(shades(len(chosen)), chosen, strict=True):
+        for style, curve in zip(DASHES, curves.shown(), strict=False):
+            _curve(axes, views[i], curve._replace(color=color), linestyle=style, marker=MARKERS[i % len(MARKERS)])
+        handles.append(entry(names[i], color=color, linewidth=3))
+    rows = zip(DASHES, curves.shown(), strict=False)
+    handles += [entry(row.name, color="0.2", linestyle=style) for style, row in rows if len(curves.names) > 1]
+    zero = all(np.nanmin(view.values()) >= 0 for view in views)
+    labelled(axes, curves.label, views[0].axis, whole=curves.whole, zero=zero)
+    below(figure, handles)
+    titled(figure, titles[0] + (f", {curves.at}" if curves.at else ""), *titles[1:])
+    return figure
+
+
 STYLES = ("-", "--", ":", "-.")
 RATIO = "actual / claimed"
 
 
 def side_table(views: Sequence[PredictionView]) -> Table:
     """Return rows of link probability and step, columns of quantities."""
+    titles = (*(view.what for view in views), views[0].whom, *dict.fromkeys(view.how for view in views))
+    return _beside(views, titles, [view.prediction.quantity for view in views])
+
+
+def _beside(views: Sequence[PredictionView], titles: Sequence[str], columns: Sequence[str]) -> Table:
+    """Return rows of link probability and step, and a column for every view."""
     cells, steady = [view.cells() for view in views], [view.steady_cells for view in views]
     rows, names = [], views[0].rows
     for i, there in enumerate(views[0].there):
@@ -426,9 +482,7 @@ def side_table(views: Sequence[PredictionView]) -> Table:
             rows.append((*names.cells(i), str(views[0].steps[k]), *(shown[i][k] for shown in cells)))
         if any(steady):
             rows.append((*names.cells(i), "steady", *("" if found is None else found[i] for found in steady)))
-    how = dict.fromkeys(view.how for view in views)
-    titles = (*(view.what for view in views), views[0].whom, *how)
-    return Table(titles, (*names.keys, "k"), tuple(view.prediction.quantity for view in views), tuple(rows))
+    return Table(tuple(titles), (*names.keys, "k"), tuple(columns), tuple(rows))
 
 
 def side_csv(views: Sequence[PredictionView]) -> str:
@@ -440,17 +494,22 @@ def side_csv(views: Sequence[PredictionView]) -> str:
 def side_json(views: Sequence[PredictionView]) -> dict[str, Any]:
     """Return the object of the first quantity, with all of them under `quantities`."""
     each = {view.prediction.quantity: predict_json(view) for view in views}
-    kept = ("values", "standard_error", "interval", "low", "high", "level", "bernstein", *STEADY)
     return {
         **each[views[0].prediction.quantity],
         "quantities": {
             name: {
-                **{key: found[key] for key in kept if key in found},
+                **_numbers(found),
                 **{key: found["meta"][key] for key in ("description", "nature", "unit")},
             }
             for name, found in each.items()
         },
     }
+
+
+def _numbers(found: dict[str, Any]) -> dict[str, Any]:
+    """What of an object for JSON is not the same for all that stand beside each other."""
+    kept = ("values", "standard_error", "interval", "low", "high", "level", "bernstein", *STEADY)
+    return {key: found[key] for key in kept if key in found}
 
 
 def draw_side(views: Sequence[PredictionView]) -> Any:

@@ -30,6 +30,7 @@ def whose(agent: int | str, names: Sequence[str] = ()) -> str:
         "mean": "covariance averaged over the agents",
         "worst": "the agent with the largest value",
         "best": "the agent with the smallest value",
+        "each": "each agent by itself",
     }
     named = f" ({names[agent - 1]})" if names and isinstance(agent, int) else ""
     return texts.get(str(agent), f"agent {agent}{named}")

@@ -18,12 +18,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stochfuse.errors import UsageError
+from stochfuse.errors import UsageError, nearest
 
 if TYPE_CHECKING:
     from stochfuse.scenario.radio import Radio
 
 ARCHITECTURES = ("ad-hoc", "broadcast", "cyclic")
+WHOSE = ("mean", "worst", "best")
+"""Whose value is asked for, where it is not that of one agent."""
 DEFAULT_LINKS = (0.0, 0.25, 0.5, 0.75, 1.0)
 """The link probabilities of the thesis, tabulated where neither the scenario nor the caller names any."""
 
@@ -69,6 +71,24 @@ class Network:
     def delay_of(self, receiver: int, sender: int) -> tuple[float, ...]:
         """Probabilities of a delay of 0, 1, 2 … steps of a link."""
         return self.delay if self.delays is None else self.delays[receiver][sender]
+
+    def agent(self, asked: int | str, words: Sequence[str] = WHOSE) -> int | str:
+        """Return who is asked for: one of the words, or an agent's number from 1, which may be given by its name.
+
+        Raises
+        ------
+        UsageError
+            If there is no such agent.
+        """
+        if isinstance(asked, str) and asked in words:
+            return asked
+        if isinstance(asked, str) and asked in self.names:
+            return self.names.index(asked) + 1
+        if isinstance(asked, int | np.integer) and not isinstance(asked, bool) and 1 <= asked <= self.agents:
+            return int(asked)
+        number = " or ".join([*filter(None, [", ".join(words)]), f"a number from 1 to {self.agents}"])
+        named = f", or one of {', '.join(self.names)}" if self.names else ""
+        raise UsageError(f"agent: expected {number}{named}, got '{asked}'{nearest(str(asked), self.names)}")
 
 
 @dataclass(frozen=True)

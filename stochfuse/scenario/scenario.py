@@ -74,6 +74,7 @@ class Scenario:
     instruments : each agent's sensor by name, the function that its H is linearised from, None for a sensor without a
         name; empty where there is none.
     nominal : (steps, d) states of the nominal path, or None.
+    replaced : its own links that gave way to a caller's probability, in words; empty where they were one number.
     """
 
     name: str
@@ -98,6 +99,7 @@ class Scenario:
     runs: int | None = None
     instruments: tuple[Instrument | None, ...] = ()
     nominal: np.ndarray | None = None
+    replaced: str = ""
 
     def __repr__(self) -> str:
         """One line."""
@@ -197,11 +199,28 @@ def load_scenario(source: str | Path | Mapping[str, Any] = DEFAULT, **overrides:
             f"scenario: expected a preset's name, a path, or a mapping with a file's keys, got {type(source).__name__}"
         )
     name, text = read_text(source)
-    mapping = _override(parse(name, text), overrides)
-    if is_preset(source):
-        # the presets' structure is checked by the tests; pydantic would double the time of a plain `predict`
-        return _build(mapping, name, [])
-    return Scenario.from_mapping(mapping, name, folder_of(source))
+    given = parse(name, text)
+    gone = _own_links(given.get("network")) if overrides.get("uniform_link") else ""
+    mapping = _override(given, overrides)
+    # the presets' structure is checked by the tests; pydantic would double the time of a plain `predict`
+    preset = is_preset(source)
+    made = _build(mapping, name, []) if preset else Scenario.from_mapping(mapping, name, folder_of(source))
+    return replace(made, replaced=gone)
+
+
+def _own_links(network: Any) -> str:
+    """What a scenario says of its links beyond one number, in words."""
+    if not isinstance(network, Mapping):
+        return ""
+    words = {"radio": "a link budget", "burst": "bursts", "case": "cases", "sent": "packets", "scale": "a factor"}
+    found, link = {key: what for key, what in words.items() if key in network}, network.get("link")
+    if isinstance(link, Mapping):
+        found["link"] = f"those of {link.get('file')}"
+    elif isinstance(link, list):
+        rows = [row for row in link if isinstance(row, list)]
+        varied = any(isinstance(entry, list) for row in rows for entry in row)
+        found["link"] = "a matrix per step" if varied else "a matrix" if rows else "one per step"
+    return ", ".join(f"network.{key} ({what})" for key, what in found.items())
 
 
 def with_links(mapping: Any, name: str, folder: Path) -> Any:

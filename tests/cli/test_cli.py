@@ -171,6 +171,64 @@ def test_agents_that_differ():
     np.testing.assert_array_equal(values["worst"], np.maximum(values["1"], values["10"]))
 
 
+def test_each_agent_has_a_column_of_its_own(tmp_path):
+    asked, p = ("predict", "road-5", "--at", "2,last", "--agent", "each"), sf.predict("road-5")
+    alone = [p.values("rms:x,y", i)[:, [1, -1]].tolist() for i in range(1, 6)]
+    found = strict_json(run(*asked, "-f", "json").stdout)
+    assert [one["agent"] for one in found["agents"]] == list("ABCDE")
+    assert [one["values"] for one in found["agents"]] == alone
+    assert found["values"] == p.values("rms:x,y")[:, [1, -1]].tolist()
+    head, *rows = csv.reader(io.StringIO(run(*asked, "-f", "csv", "--plot", tmp_path / "each.svg").stdout))
+    assert head[-6:] == ["step", *"ABCDE"]
+    assert [[float(cell) for cell in row[-5:]] for row in rows] == [[one[0][k] for one in alone] for k in range(2)]
+    assert "each agent by itself" in (tmp_path / "each.svg").read_text()
+    text = run(*asked).stdout.splitlines()
+    assert text[2] == "road-5: 5 agents, ad-hoc; each agent by itself"
+    assert [len(line.split()) for line in text[5:] if line.strip(" ─")] == [8, 7, 7]
+
+
+def test_each_agent_of_a_sample_has_its_standard_error():
+    asked = ("--link", "0.5", "--steps", "2", "--method", "monte-carlo", "--runs", "4", "--control", "none")
+    head, first, _ = csv.reader(io.StringIO(run("predict", *asked, "--agent", "each", "-f", "csv").stdout))
+    assert head[-6:] == [f"agent {i}{more}" for i in (1, 2, 3) for more in ("", " standard_error")]
+    _, alone, _ = csv.reader(io.StringIO(run("predict", *asked, "--agent", "2", "-f", "csv").stdout))
+    assert first[-4:-2] == alone[-2:]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--quantity", "claimed,actual"), "--agent each: expected one --quantity, got claimed,actual"),
+        (
+            ("--over", "network.agents=2:4:1"),
+            "--agent each: expected as many agents in every row, got --over network.agents=2:4:1",
+        ),
+    ],
+)
+def test_each_agent_is_refused_where_there_is_no_column(words, message):
+    assert run("predict", "--agent", "each", *words, code=2).stderr == f"error: {message}\n"
+
+
+@pytest.mark.parametrize(
+    ("own", "said"),
+    [
+        ("link = 0.3", None),
+        ("link = [0.3, 0.4]", "network.link (one per step)"),
+        ("link = [[0, 0.4], [1, 0]]", "network.link (a matrix)"),
+        ("link = [[[0, 0.4], [1, 0]], 0.5]", "network.link (a matrix per step)"),
+        ('link = { file = "nowhere.csv" }', "network.link (those of nowhere.csv)"),
+        ("link = 0.3\nburst = { good_to_bad = 0.1, bad_to_good = 0.5 }", "network.burst (bursts)"),
+        ("[network.radio]\ntransmit_power = 20", "network.radio (a link budget)"),
+    ],
+)
+def test_a_link_says_what_it_takes_the_place_of(own, said):
+    text = f"[model]\nF=1\nH=1\nQ=1\nR=1\n[initial]\nP=1\n[network]\nagents = 2\nsteps = 2\n{own}\n"
+    done = run("predict", "-", "--link", "0.6", "-f", "csv", input=text)
+    told = [line for line in done.stderr.splitlines() if "--link" in line]
+    assert told == [f"note: --link takes the place of the scenario's own links: {said}"] * (said is not None)
+    assert done.stdout == run("predict", "-", "--link", "0.6", "-f", "csv", input=text.replace(own, "")).stdout
+
+
 def test_scenario_from_standard_input_file_and_json(tmp_path):
     text = run("scenario", "show", "cv-2d").stdout
     (tmp_path / "mine.toml").write_text(text)

@@ -172,6 +172,41 @@ def test_noises_that_are_told_wrong(name, change, expected, text):
     assert re.search(text, first.text), first.text
 
 
+MOVING = {
+    "model": {"states": ["x", "v"], "F": [[1, 1], [0, 1]], "H": [[1, 0]], "Q": [[0.05, 0.1], [0.1, 0.2]], "R": 4},
+    "initial": {"P": [[100, 0], [0, 25]]},
+    "network": {"agents": 3, "steps": 60, "link": 0.6},
+}
+PLANE = {
+    "kind": "constant-velocity", "axes": 2, "step": 1.0, "noise": 0.3, "sensor": {"kind": "position", "sigma": 2},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("model", "change", "expected", "text"),
+    [
+        (MOVING["model"], {"F": [[1, 2], [0, 1]]}, "step-length", r"steps 0\.5 times as long .*\(NEES"),
+        (
+            MOVING["model"],
+            {"F": [[1, 0], [0, 1]]},
+            "coupling",
+            r"the motion: (1|0\.9\d?|1\.1) v that goes into x .*\(NIS",
+        ),
+        (PLANE, {"step": 10.0}, "step-length", r"the motion: steps 0\.1 times as long as .*\(NIS"),
+        (PLANE, {"step": 0.5}, "Q-scaled", r"a Q of .* times the scenario's, or the motion: steps 2 times as long as"),
+    ],
+)
+def test_motion_that_is_told_wrong(model, change, expected, text):
+    """Drawn by one motion and told another; of places alone longer steps and more noise look alike."""
+    start = {"P": np.kron(np.eye(len(model.get("states", "abcd")) // 2), MOVING["initial"]["P"]).tolist()}
+    s, wrong = (sf.load_scenario(MOVING | {"initial": start, "model": m}) for m in (model, model | change))
+    batch = next(Draws(s, ("1", "2", "3"), link_rows(s), 1).batches())
+    assert told("", batch, s) == ()
+    first = told("", batch, wrong)[0]
+    assert (first.suspicion, first.agent, first.explains) == (expected, None, True)
+    assert re.search(text, first.text), first.text
+
+
 def test_two_faults_are_told_one_after_the_other():
     batch = altered(2, 1, np.rad2deg)(drawn("two-radars"))
     batch = altered(1, 0, lambda z: z + 150)(batch)

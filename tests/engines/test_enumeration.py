@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 import stochfuse as sf
 from stochfuse.engines import enumeration
-from stochfuse.engines.progress import Progress, listening
 from stochfuse.estimators.local_fusion_graph import LocalFusionGraph
 from stochfuse.estimators.naive import NaiveFusion
+from stochfuse.estimators.progress import Progress, listening
 from stochfuse.estimators.protocol import FusionRule
 from stochfuse.kalman.metrics import metric
 from stochfuse.prediction import general

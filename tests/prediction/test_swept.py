@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import stochfuse as sf
-from stochfuse.engines.progress import Progress, listening
 from stochfuse.errors import NoAnswerError, UsageError
+from stochfuse.estimators.progress import Progress, listening
 from stochfuse.questions.messages import accuracy
 
 BASE = {

@@ -279,7 +279,7 @@ def test_too_rare_whatever_is_swept():
             "without memory, got network.burst",
         ),
         (network(1.5, [1.0, None], delay=1), {}, "without delay"),
-        (COMPLEMENTARY, {"agent": 3}, "agent: expected mean, worst, best or a number from 1 to 2, got 3"),
+        (COMPLEMENTARY, {"agent": 3}, "agent: expected mean, worst, best or a number from 1 to 2, got '3'"),
         (COMPLEMENTARY, {"agent": True}, "agent: expected mean"),
         (
             COMPLEMENTARY,

@@ -1,6 +1,6 @@
 """What long work says of how far it is, to whoever listens.
 
-An engine does not know who asked.  It says `listener().advance("step 3", done, total)`, and whoever wants to know of
+Who works does not know who asked.  It says `listener().advance("step 3", done, total)`, and whoever wants to know of
 the work wraps it in `with listening(progress):`; without that nobody hears it, and it costs nothing worth naming.
 """
 
