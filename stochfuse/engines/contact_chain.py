@@ -64,12 +64,10 @@ from stochfuse.errors import UsageError
 from stochfuse.kalman.algebra import NUMPY
 from stochfuse.kalman.kernel import (
     AsTheyAre,
-    Estimate,
     SquareRootNumbers,
     at_step,
     from_factor,
     posterior_gain,
-    predict,
     predict_factor,
     update_factor,
 )
@@ -161,7 +159,7 @@ def by_age(delay: Sequence[float], µ: np.ndarray, burst: np.ndarray | None, old
     ----------
     delay : probabilities of a delay of 0, 1, 2 … steps.
     """
-    in_time = np.cumsum(delay)[np.minimum(range(oldest + 1), len(delay) - 1)]
+    in_time = np.array([sum(delay[: age + 1]) for age in range(oldest + 1)])
     return µ[:, None] * in_time if burst is None else delivery_after_failures(burst, in_time)
 
 
@@ -453,7 +451,7 @@ class LosslessFilter(NamedTuple):
         sensors = [(given.rounded(at_step(s.H, step)), given.noise(at_step(s.R, step))) for s in self.sensors]
         arrived = [(H, R, n) for kind, (H, R) in enumerate(sensors) if (n := counts[..., kind]).any()]
         if self.scalar:
-            x, P = predict(Estimate(*before), F, Q)
+            x, P = None if before.x is None else F * before.x, F * before.root * F + Q
             # all that measurements of a scalar say, whatever their size
             gained = 1.0 + P * sum(n[..., None, None] * (H.T @ NUMPY.solve(R, H)) for H, R, n in arrived)
             return AlongPath(None if x is None else x / gained, P / gained)
