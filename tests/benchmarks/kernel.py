@@ -27,7 +27,7 @@ STEPS = 5
 OURS, MANY = "stochfuse, kalman.covariances", "stochfuse, predict_many (checked, every step)"
 HEADINGS = ("work", *("stacks", "arrays", "stochfuse"), "over stacks", "over arrays")
 SIZES = ((1, 1), (2, 1), (2, 2), (4, 1), (4, 2), (4, 4), (6, 2), (6, 6), (9, 3), (9, 6), (15, 3), (15, 6))
-LARGEST, LONGEST, FEWEST = 20_000_000, 8.0, 3
+LARGEST, LONGEST, FEWEST = 20_000_000, 5.0, 3
 """Numbers in all covariances of a row over sizes (4 GB with all copies), CPU seconds after which it ends, rounds."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 Run = Callable[[], np.ndarray]
