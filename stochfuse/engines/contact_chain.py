@@ -64,12 +64,10 @@ from stochfuse.estimators.progress import listener
 from stochfuse.kalman.algebra import NUMPY
 from stochfuse.kalman.kernel import (
     AsTheyAre,
-    Estimate,
     SquareRootNumbers,
     at_step,
     from_factor,
     posterior_gain,
-    predict,
     predict_factor,
     update_factor,
 )
@@ -161,7 +159,7 @@ def by_age(delay: Sequence[float], µ: np.ndarray, burst: np.ndarray | None, old
     ----------
     delay : probabilities of a delay of 0, 1, 2 … steps.
     """
-    in_time = np.cumsum(delay)[np.minimum(range(oldest + 1), len(delay) - 1)]
+    in_time = np.array([sum(delay[: age + 1]) for age in range(oldest + 1)])
     return µ[:, None] * in_time if burst is None else delivery_after_failures(burst, in_time)
 
 
@@ -233,20 +231,15 @@ class _Growth(NamedTuple):
     Parameters
     ----------
     sizes : how many agents each class has.
-    possible : whether a receiver of one class may ever hear a sender of another, (classes, classes), as bytes.
+    possible : whether a receiver of one class may ever hear a sender of another, (classes, classes).
     everyone : whether all hear what one hears.
     ages : ages 0 … that are told apart.
     """
 
     sizes: tuple[int, ...]
-    possible: bytes
+    possible: tuple[tuple[bool, ...], ...]
     everyone: bool
     ages: int
-
-    @property
-    def hears(self) -> np.ndarray:
-        """`possible` as an array."""
-        return np.frombuffer(self.possible, dtype=bool).reshape(len(self.sizes), -1)
 
     def following(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Classes that may join a state, and the states that may follow, (states, classes, ages).
@@ -254,7 +247,7 @@ class _Growth(NamedTuple):
         Every number that may join of the first such class with every one of the next, the last one fastest.
         """
         inside = state.sum(axis=1)
-        joining = np.flatnonzero((inside < self.sizes) & self.hears[inside > 0].any(axis=0))
+        joining = np.flatnonzero((inside < self.sizes) & np.array(self.possible)[inside > 0].any(axis=0))
         left = (self.sizes - inside)[joining]
         number = prod((left + 1).tolist())
         if number > MOST_STATES:
@@ -279,7 +272,7 @@ class _Growth(NamedTuple):
             oldest = self.ages - 1 - (states.sum(axis=1)[:, ::-1] > 0).argmax(axis=1)
             same, age = np.ones_like(waits), np.where(waits, oldest[:, None], self.ages - 1)
         else:
-            same, age = ~(waiting @ self.hears.T), np.full(inside.shape, self.ages - 1)
+            same, age = ~(waiting @ np.transpose(self.possible)), np.full(inside.shape, self.ages - 1)
         one = np.zeros_like(states)
         np.put_along_axis(one, age[:, :, None], inside[:, :, None], axis=2)
         return np.where(same[:, :, None], one, states)
@@ -325,7 +318,7 @@ def _of_classes(
     classes = _Classes(network, rows, alike(network, rows, kinds), ages)
     class_of = {agent: c for c, members in enumerate(classes.members) for agent in members}
     sizes = tuple(map(len, classes.members))
-    growth = _Growth(sizes, classes.possible.tobytes(), network.architecture == "broadcast", ages)
+    growth = _Growth(sizes, tuple(map(tuple, classes.possible.tolist())), network.architecture == "broadcast", ages)
     states, starts, follow = _reached(growth, tuple(class_of[agents[0]] for agents in groups))
     left = (sizes - states.sum(axis=2)).tolist()
 
@@ -453,7 +446,7 @@ class LosslessFilter(NamedTuple):
         sensors = [(given.rounded(at_step(s.H, step)), given.noise(at_step(s.R, step))) for s in self.sensors]
         arrived = [(H, R, n) for kind, (H, R) in enumerate(sensors) if (n := counts[..., kind]).any()]
         if self.scalar:
-            x, P = predict(Estimate(*before), F, Q)
+            x, P = None if before.x is None else F * before.x, F * before.root * F + Q
             # all that measurements of a scalar say, whatever their size
             gained = 1.0 + P * sum(n[..., None, None] * (H.T @ NUMPY.solve(R, H)) for H, R, n in arrived)
             return AlongPath(None if x is None else x / gained, P / gained)

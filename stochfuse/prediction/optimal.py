@@ -83,7 +83,7 @@ def averaged(system: System, items: Items, how: Settings, errors: bool) -> Avera
             return _sampled(system, items, how, errors, str(error))
         if float(found.bound.max()) > LOOSE:
             return _sampled(system, items, how, errors, f"bounds on the optimum would be {found.bound.max():.1g} apart")
-    bound, far = float(found.bound.max()), np.broadcast_to(found.rounding, len(items))
+    bound, far = float(found.bound.max()), np.asarray(found.rounding)
     said = [f"the optimum is proved to lie within a relative {bound:.0e} of the value shown"] if bound else []
     return Averaged(
         # what the optimum claims is what it achieves

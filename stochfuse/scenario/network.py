@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -186,12 +187,16 @@ def restricted(rows: LinkRows, network: Network) -> LinkRows:
     return replace(rows, link=link * network.hears)
 
 
+@lru_cache(maxsize=4)
 def possible_senders(architecture: str, agents: int) -> np.ndarray:
-    """Whom each agent may hear: indices of shape (agents, number of possible senders)."""
+    """Whom each agent may hear: indices of shape (agents, number of possible senders), not to be written to."""
     everyone = np.arange(agents)
     if architecture == "cyclic":
-        return ((everyone + 1) % agents)[:, None][:, : min(1, agents - 1)]
-    return np.broadcast_to(everyone, (agents, agents))[~np.eye(agents, dtype=bool)].reshape(agents, agents - 1)
+        found = ((everyone + 1) % agents)[:, None][:, : min(1, agents - 1)]
+    else:
+        found = np.broadcast_to(everyone, (agents, agents))[~np.eye(agents, dtype=bool)].reshape(agents, agents - 1)
+    found.setflags(write=False)
+    return found
 
 
 def reachable(network: Network) -> np.ndarray:

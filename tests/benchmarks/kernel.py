@@ -1,10 +1,10 @@
 """Covariance recursions of many filters with noises of their own, against what others write for one thread.
 
-`python -m tests.benchmarks.kernel [--quick] [--most FILTERS]`.  Every way gets the noises in the layout that suits it, goes
+`python -m tests.benchmarks.kernel [--quick] [--sizes] [--most FILTERS]`.  Every way gets the noises in the layout that suits it, goes
 through five steps of predict and update, and returns the last covariances; answers must agree with the literal stacks.  JAX
 and Numba (extra `bench`) compile before they are timed, and so do our filters (extra `compiled`), at every size unless
 STOCHFUSE_COMPILED=0; what is not installed is named and left out.  Times are CPU time, the ways in turns, so that other work
-on the machine hits all alike; the lower quartile is shown.
+on the machine hits all alike; the lower quartile is shown.  What is small is done in a row, as it is where it matters.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ STEPS = 5
 OURS, MANY = "stochfuse, kalman.covariances", "stochfuse, predict_many (checked, every step)"
 HEADINGS = ("work", *("stacks", "arrays", "stochfuse"), "over stacks", "over arrays")
 SIZES = ((1, 1), (2, 1), (2, 2), (4, 1), (4, 2), (4, 4), (6, 2), (6, 6), (9, 3), (9, 6), (15, 3), (15, 6))
+LARGEST, LONGEST, FEWEST = 20_000_000, 5.0, 3
+"""Numbers in all covariances of a row over sizes (4 GB with all copies), CPU seconds after which it ends, rounds."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 Run = Callable[[], np.ndarray]
 
@@ -272,12 +274,16 @@ def measured(ways: dict[str, Run], units: int, rounds: int) -> dict[str, float]:
         if not found < 1e-9:
             raise SystemExit(f"kernel: {name}: expected agreement to 1e-9, got a difference of {found:.3g}")
     times: dict[str, list[float]] = {name: [] for name in ways}
-    for _ in range(rounds):
+    begin, in_a_row = time.process_time(), max(1, 100_000 // units)
+    for done in range(rounds):
+        if done >= FEWEST and time.process_time() - begin > LONGEST:
+            break
         for name, run in ways.items():
             start = time.process_time()
-            run()
+            for _ in range(in_a_row):
+                run()
             times[name].append(time.process_time() - start)
-    return {name: float(np.quantile(each, 0.25)) / units * 1e9 for name, each in times.items()}
+    return {name: float(np.quantile(each, 0.25)) / in_a_row / units * 1e9 for name, each in times.items()}
 
 
 def at_the_limit(own: bool, quick: bool) -> tuple[str, list[tuple[str, ...]]]:
@@ -297,12 +303,14 @@ def sizes(quick: bool, most: int) -> list[tuple[str, ...]]:
     """Stacks and struct of arrays against the kernel, over states, measurements and filters."""
     rows = []
     for d, p in SIZES[:2] if quick else SIZES:
-        for items in (100,) if quick else (100, 1000, 10_000, 100_000, 1_000_000):
-            if items > most or items * d * d > 20_000_000:  # Q, R and P of a million filters of 15 states are 4 GB
+        for size in (100,) if quick else (100, 1000, 10_000, 100_000, 1_000_000):
+            items = min(size, LARGEST // d**2)
+            if items > most or items < size // 10:
                 continue
+            print(f"kernel: {d} states, {p} measured, {items:,} filters", file=sys.stderr)
             given = work(items, d, p)
             ways = {"NumPy, stacks": stacks(given), "NumPy, struct of arrays": arrays(given), OURS: ours(given)[OURS]}
-            found = list(measured(ways, items * STEPS, 1 if quick else int(np.clip(300_000 / items, 3, 60))).values())
+            found = list(measured(ways, items * STEPS, 1 if quick else 60).values())
             name = f"{d} states, {p} measured, {items:,} filters"
             ratios = (f"{found[2] / found[0]:.2f}", f"{found[2] / found[1]:.2f}")
             rows.append((name, *(f"{ns:.3g} ns" for ns in found), *ratios))
@@ -317,12 +325,13 @@ def absent() -> list[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.kernel", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="few filters, one round: only that it runs and agrees")
+    parser.add_argument("--sizes", action="store_true", help="only the table over sizes: ten minutes, 4 GB")
     parser.add_argument("--most", type=int, default=1_000_000, help="filters, of the table over sizes")
     given = parser.parse_args()
     quick = given.quick
     from tests.benchmarks.__main__ import show
 
-    for own in (False, True):
+    for own in () if given.sizes else (False, True):
         title, rows = at_the_limit(own, quick)
         show(title, ("way", "time", "over stochfuse's"), rows)
     show("Over sizes, common F and H; CPU time of a filter-step", HEADINGS, sizes(quick, given.most))
