@@ -161,7 +161,8 @@ class MomentSample:
             if constant or self.control is None:
                 error = error if error > rounding else 0.0
             known = self.control is not None and self.control.expected.further is None
-            if any(self.scarce(row, step, g) for g in groups) and (constant or known):
+            scarce = any(self.scarce(row, step, g) for g in groups)
+            if (constant and known) or (scarce and (constant or known)):  # a correction that no run speaks for
                 error = max(error, self._unseen(of, mean, drawn))
             if self.control is not None and not constant:
                 # what the control takes away whole is still known to rounding only

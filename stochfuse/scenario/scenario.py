@@ -444,12 +444,14 @@ def _override_noise(mapping: dict[str, Any], entry: str, value: Any) -> None:
         If only agents' own sensors have an R, or if what is to have a root is no number.
     """
     model = mapping["model"]
+    agents = tables_of(mapping.get("agent"))
+    own = [table.get("sensor") is False or is_named(table.get("sensor")) or "R" in table for table in agents]
     if entry == "Q" and model.get("kind") is not None:
         model["noise"] = _root("q", value) if model.get("noise_kind") == "piecewise" else value
+    elif entry == "R" and own and all(own) and "navigation" not in mapping:
+        raise UsageError("r: expected a sensor of the model (model.R or model.sensor), got agents with their own alone")
     elif entry == "R" and is_named(model.get("sensor")):
         model["sensor"] = {**model["sensor"], "sigma": _root("r", value)}
-    elif entry == "R" and "H" not in model and "agent" in mapping and "navigation" not in mapping:
-        raise UsageError("r: expected a sensor of the model (model.R or model.sensor), got agents with their own alone")
     else:
         model[entry] = value
 

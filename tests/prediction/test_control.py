@@ -250,3 +250,20 @@ def test_a_control_is_asked_for_by_name():
         drawn(small(), [0.5], control="antithetic")
     with pytest.raises(sf.UsageError, match="control: expected method monte-carlo, whose values are sampled, got gen"):
         sf.predict(small(), [0.5], "general", control="none")
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_a_correction_that_no_run_speaks_for_is_no_certainty(seed):
+    # agent 1 takes nothing from agent 2, whose estimate is worse; only the optimum differs, in outcomes not met here
+    source = {
+        "model": {"F": 1, "H": 1, "Q": 1, "R": 1},
+        "initial": {"P": 50},
+        "network": {"agents": 2, "steps": 4, "link": [0.5, 0.9, 0.9, 0.7]},
+        "agent": [{}, {"sensor": False}],
+    }
+    asked = {"estimator": "covariance-intersection"}
+    drawn = sf.predict(source, method="monte-carlo", runs=300, seed=seed, **asked)
+    exact = sf.predict(source, method="general", **asked).values(agent=1)
+    off = np.abs(drawn.values(agent=1) - exact)
+    assert (off > 1e-6 * exact).any()
+    assert (off <= 1.01 * drawn.standard_error(agent=1) + 1e-9 * exact).all()

@@ -307,3 +307,12 @@ def test_a_number_is_that_multiple_of_the_identity():
 def test_a_tiny_asymmetry_from_printing_is_mended():
     s = sf.Scenario.from_mapping(changed("initial.P", [[1, 0.3333333333], [0.33333333333, 1]]))
     np.testing.assert_array_equal(s.P0, s.P0.T)
+
+
+@pytest.mark.parametrize("agents", [[{"R": 2.0}, {"R": 5.0}], [{"R": 2.0}, {"sensor": False}]])
+def test_r_is_of_agents_without_their_own(agents):
+    source = {"model": {"F": 1, "H": 1, "Q": 1, "R": 1}, "initial": {"P": 4}, "network": {"agents": 2, "steps": 3}}
+    with pytest.raises(sf.UsageError, match=r"r: expected a sensor of the model .* got agents with their own alone"):
+        sf.load_scenario({**source, "agent": agents}, r=7.0)
+    other = sf.load_scenario({**source, "agent": [agents[0], {}]}, r=7.0)
+    assert other.sensors[other.sensor_of[1]].R == 7.0
