@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import log1p
+from math import inf, log1p
 from typing import NamedTuple
 
 import numpy as np
@@ -92,7 +92,7 @@ class Fits:
         for b, block in enumerate(self.blocks):
             r, C = np.array([cell.mean for cell in block.cells]) - means.mean[b], means.noise[b]
             known, floor = np.flatnonzero(~np.isnan(r)), self._floor(b)
-            # cells of which a mistake says nothing are as far off as they were
+            # cells of which a mistake says nothing are as far off as they were; of none it explains nothing
             wrong = [cell for cell, unknown in zip(block.cells, np.isnan(r), strict=True) if unknown]
             untold += len(wrong)
             off += sum(log1p(((c.mean - c.expected) / c.error) ** 2) for c in wrong if c.error > 0)
@@ -113,6 +113,8 @@ class Fits:
             T, d = _hotelling(np.copysign(beyond, r)[loose], C[np.ix_(loose, loose)], self._sample(b, runs))
             distance, freedom = distance + T + float((z[fixed] ** 2).sum()), freedom + d
         left = max(freedom - (0 if exact else estimated), 1)
+        if not where:
+            return Fit(0.0, left, 0.0, inf, 0.0, "", untold)
         return Fit(distance, left, float(chdtrc(left, distance)), off, largest, where, untold)
 
     def scales(self, means: Means) -> list[np.ndarray]:

@@ -501,6 +501,11 @@ MISTAKES = (
     ),
     Mistake("three-sigma", "three standard deviations are shown", lambda s: _shown(s, _three)),
     Mistake("sum-for-mean", "a sum over agents or states is shown for a mean, or a mean for a sum", _sum),
+    Mistake(
+        "nees-per-state",
+        "NEES is divided by the number of states",
+        lambda s: iter([_certain(replace(s, nees=1.0 / s.system.dimension))] if s.system.dimension > 1 else []),
+    ),
     Mistake("wrong-metric", "another number is made of the covariance matrix", _metric),
     Mistake("one-agent-for-mean", "one agent stands for all", _one_agent),
     Mistake("agents-swapped", "the agents are numbered otherwise", _swapped),

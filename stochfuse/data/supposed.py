@@ -89,6 +89,7 @@ class Simulator:
     whose : the agent, from 1, that is shown in the place of each; empty: itself.
     shown : what is made of claimed numbers, in turn.
     metric : what is made of claimed covariances first; None: what the cell says.
+    nees : factor by which NEES is shown.
     claimed_only : whether stage and shift concern what is claimed alone, and errors are shown as they should be.
     followed : whether errors are looked at.
     """
@@ -105,6 +106,7 @@ class Simulator:
     whose: tuple[int, ...] = ()
     shown: tuple[Shown, ...] = ()
     metric: Metric | None = None
+    nees: float = 1.0
     claimed_only: bool = False
     followed: bool = False
 
@@ -357,7 +359,7 @@ class _Reading:
 
     def _number(self, cell: Cell, m: Moments) -> np.ndarray:
         if cell.quantity == NEES:
-            return np.trace(np.linalg.solve(m.P, m.square), axis1=-2, axis2=-1)
+            return np.trace(np.linalg.solve(m.P, m.square), axis1=-2, axis2=-1) * self.simulator.nees
         sense = metric_of(cell.metric, self.simulator.system.model)
         if cell.quantity == CLAIMED:
             return (self.simulator.metric or sense).of(m.P)

@@ -117,8 +117,8 @@ class Prediction(Result):
         Parameters
         ----------
         of : a `stochfuse.kalman.metrics.Metric` or its name.
-        agent : "mean" (of the covariance averaged over the agents), a number from 1, or "worst" or "best" (the largest
-            or smallest value among the agents, for each link and step).
+        agent : "mean" (of the covariance averaged over the agents), a number from 1, a name, or "worst" or "best" (the
+            largest or smallest value among the agents, for each link and step).
         """
         return self._reduce(self.moments, of, agent)
 

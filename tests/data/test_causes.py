@@ -190,6 +190,20 @@ def test_the_door_takes_cells_of_ones_own():
     assert "(the sum over agents)" in first.text
 
 
+def test_of_nees_alone_a_mistake_that_says_nothing_of_it_explains_nothing():
+    """Two agents that always hear each other keep the optimum, whose NEES is χ² of two states: here its half."""
+    runs, steps = 300, 2
+    nees = np.random.default_rng(5).chisquare(2, runs * steps) / 2.0
+    run, step = np.divmod(np.arange(runs * steps), steps)
+    verdict = sf.crosscheck(
+        {"run": run, "step": step + 1, "link": np.ones(runs * steps), "nees": nees}, scenario(MOVING)
+    )
+    assert not verdict.agrees
+    first, *others = verdict.causes
+    assert (first.cause, first.explains) == ("nees-per-state", True)
+    assert not any(cause.explains for cause in others if cause.cause == "not-brought-forward")
+
+
 @pytest.mark.slow
 def test_the_command_line_names_causes(tmp_path):
     """Expected at µ = 0.75 and sent as those of µ = 0.25."""

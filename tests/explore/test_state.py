@@ -12,12 +12,14 @@ import pytest
 
 import stochfuse as sf
 from stochfuse.errors import ScenarioError, StochfuseError, UsageError
+from stochfuse.estimators.progress import Progress, listening
 from stochfuse.explore import answers, saved
 from stochfuse.explore.answers import QuestionWorker
 from stochfuse.explore.network import picture
 from stochfuse.explore.saved import PageContents
 from stochfuse.explore.state import OpenedScenario, PageInput, begun, field_of, opened, preset, with_log
 from stochfuse.scenario.as_toml import to_toml
+from stochfuse.scenario.registry import LFG
 from tests.cli.command import run, strict_json
 
 EDGES = b"receiver,sender,link\na,b,0.3\nb,a,0.6\n"
@@ -262,6 +264,27 @@ def test_what_is_no_longer_asked_is_given_up_and_never_handed_on():
     while any(thread.name.startswith("stochfuse-page") for thread in threading.enumerate()):
         assert time.monotonic() < deadline
         time.sleep(0.05)
+
+
+def test_a_sample_is_there_soon_and_then_again_and_tells_of_itself_step_by_step():
+    question = asked(agents=5, steps=4, link=0.5)
+    jobs, told = list(answers.exact(question)), []
+
+    class Told(Progress):
+        def advance(self, what, done, total):
+            told.append((what, done))
+
+    names = [name for name, _ in jobs]
+    assert names == [f"estimator {LFG}", "optimal", "messages", f"estimator {LFG}"]
+    with listening(Told()):
+        (soon, _), (later, _) = jobs[0][1](), jobs[-1][1]()
+    assert {(what, k) for what in ("histories", "information", "estimates") for k in range(1, 5)} <= set(told)
+    assert "20 runs" in soon.how
+    assert "100 runs" in later.how
+    width = [line.high[-1] - line.low[-1] for line in (soon.steps, later.steps)]
+    assert 0 < width[1] < width[0] / 2
+    assert abs(soon.steps.y[-1] - later.steps.y[-1]) < 1.5 * width[0]
+    assert [name for name, _ in answers.exact(asked(steps=2, link=0.5))] == ["optimal", "messages", f"estimator {LFG}"]
 
 
 def test_a_refusal_is_an_answer():
