@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
-from functools import cached_property
+from functools import cached_property, reduce
 from itertools import combinations
 from typing import Any, NamedTuple, cast
 
@@ -519,8 +519,8 @@ class Claimed:
             some = slice(first, first + size)
             by_factor = np.add.reduceat(self._of(values, some), self.view.starts, axis=2)
             found += np.tensordot(self.states[some], by_factor, axes=((0,), (1,)))
-        weighed = [self.bookkeeping.weighed(found[..., f], factor) for f, factor in enumerate(factors)]
-        return self.shared(np.sum(weighed, axis=0))
+        weighed = (self.bookkeeping.weighed(found[..., f], factor) for f, factor in enumerate(factors))
+        return self.shared(reduce(np.add, weighed))
 
     def shared(self, found: np.ndarray) -> np.ndarray:
         """What is known before the last exchange counts, (width, ...), after it: (groups, full width, ...)."""
