@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
-from functools import cached_property
+from functools import cached_property, reduce
 from itertools import combinations
 from typing import Any, NamedTuple, cast
 
@@ -34,7 +34,7 @@ from stochfuse.engines.events import ChanceEvent, Outcome, Rows, Weights, concer
 from stochfuse.errors import TooManyError
 from stochfuse.estimators.ledger import different, numbered
 from stochfuse.estimators.progress import listener, uncollected
-from stochfuse.estimators.protocol import AdditiveEstimator, Estimator
+from stochfuse.estimators.protocol import AdditiveEstimator, AdditiveLayer, Estimator, Exchange
 from stochfuse.scenario.system import Detection
 
 MOST_GENERATORS = 6
@@ -213,11 +213,12 @@ def _next_layer(
 ) -> dict[Any, Any]:
     times, found = request.weights.times, {}
     total, progress, done = len(layer), listener(), 0
-    for states, weights, exchanges in _in_parts(estimator, layer, possible, request):
-        if exchanges is None:
-            followed = (_after(estimator, state, possible, request.plain) for state in states)
+    for weights, exchanges in _in_parts(estimator, layer, possible, request):
+        if isinstance(exchanges, list):
+            followed = (_after(exchange, possible, request.plain) for exchange in exchanges)
         else:
-            which, after = exchanges.after(np.array([outcome.heard for outcome in possible]))
+            heard = np.array([outcome.heard for outcome in possible])
+            which, after = exchanges.after(heard, np.array([outcome.missed for outcome in possible]))
             followed = ([after[number] for number in numbers] for numbers in which.tolist())
         for weight, reached in zip(weights, followed, strict=True):
             for outcome, state in zip(possible, reached, strict=True):
@@ -229,27 +230,21 @@ def _next_layer(
     return found
 
 
-def _after(estimator: Estimator, state: Any, possible: list[Outcome], plain: bool) -> Iterator[Any]:
-    """What a state becomes in every outcome, one by one."""
-    exchange = state if plain else estimator.exchange(state)
-    for outcome in possible:
-        if plain:
-            yield exchange.onward(outcome.heard, outcome.late, outcome.missed)
-        else:
-            yield exchange.after(outcome.heard, outcome.late, outcome.missed)[0]
+def _after(exchange: Exchange, possible: list[Outcome], plain: bool) -> Iterator[Any]:
+    """What an exchange leads to in every outcome, one by one."""
+    for heard, late, _, missed in possible:
+        yield exchange.onward(heard, late, missed) if plain else exchange.after(heard, late, missed)[0]
 
 
 def _in_parts(
     estimator: Estimator, layer: dict[Any, Any], possible: list[Outcome], request: Request
-) -> Iterator[tuple[list[Any], list[Any], Any]]:
-    """States with weights, and their exchanges many at a time, None where they are gone through one by one."""
-    states, weights = list(layer), list(layer.values())
-    plain = request.plain or not estimator.additive or any(outcome.late or outcome.missed for outcome in possible)
+) -> Iterator[tuple[list[Any], list[Exchange] | AdditiveLayer]]:
+    """Weights of some states at a time, and their exchanges."""
+    states, weights, late = list(layer), list(layer.values()), any(outcome.late for outcome in possible)
     size = max(1, AT_A_TIME // (len(possible) * len(estimator.relabellings)))
     for first in range(0, len(states), size):
         some = states[first : first + size]
-        together = None if plain else cast(AdditiveEstimator, estimator).together(some)
-        yield some, weights[first : first + size], together
+        yield weights[first : first + size], some if request.plain else _opened(estimator, some, late)
 
 
 def _likeliest(layer: dict[Any, np.ndarray], request: Request) -> dict[Any, np.ndarray]:
@@ -320,20 +315,37 @@ def _ending(
 ) -> Ending:
     """Carry out the last exchange for every state: one view per agent."""
     weights, views = request.weights, []
-    exchanges = layer if request.plain else [estimator.exchange(state) for state in layer]
+    states = list(layer)
+    parts = [states[first : first + TOGETHER] for first in range(0, len(states), TOGETHER)]
+    opened = parts if request.plain else [_opened(estimator, part) for part in parts]
     for group, agents in enumerate(request.groups):
         for agent in agents:
             concerned = [e._replace(receivers=(agent,)) for e in concerning(last, [agent])]
             concerned = last if estimator.joint else concerned
-            _check_ending(len(exchanges), len(concerned))
+            _check_ending(len(states), len(concerned))
             possible = outcomes(concerned, request.agents, 0, weights)
-            ids = np.array([[x.fused(agent, o.heard) for o in possible] for x in exchanges])
+            ids = np.concatenate([_fused(exchanges, agent, possible) for exchanges in opened])
             factors = weights.factors([o.factor for o in possible], len(concerned))
             share = weights.factors([weights.none()], 0)[0] / len(agents)
             shares = [share if g == group else None for g in range(len(request.groups))]
             cells = np.arange(len(possible))
             views.append(FusedSet(ids, ((1, cells),), cells, factors, shares))
     return Ending(step, weights.table(list(layer.values()), degree), views, events)
+
+
+def _opened(estimator: Estimator, states: list[Any], late: bool = False) -> list[Exchange] | AdditiveLayer:
+    """Exchanges of some states, all together where they can stand in arrays and no message will be late."""
+    arrays = estimator.additive and not late
+    together = cast(AdditiveEstimator, estimator).together(states) if arrays else None
+    return [estimator.exchange(state) for state in states] if together is None else together
+
+
+def _fused(exchanges: list[Exchange] | AdditiveLayer, agent: int, possible: list[Outcome]) -> np.ndarray:
+    """Values that an agent claims, (exchanges, outcomes)."""
+    if isinstance(exchanges, list):
+        return np.array([[exchange.fused(agent, o.heard) for o in possible] for exchange in exchanges])
+    sets, index = np.unique([o.heard[agent] for o in possible], return_inverse=True)
+    return exchanges.commons(sets[:, None].tolist())[:, index]
 
 
 def _two_step_ending(
@@ -452,14 +464,13 @@ class _LastViews:
                 self._clauses.append(tuple({int(h[cell]) for h in heard}))
         return np.array([self._common[table] for table in found.tolist()])[where]
 
-    def values(self, states: Sequence[Any]) -> np.ndarray:
+    def values(self, states: list[Any]) -> np.ndarray:
         """Values for some states, brought forward, (states, values); −1 for nothing."""
-        ledger, together = self.estimator.ledger, self.estimator.together(states)
-        if together is not None:
-            commons = together.commons(self._clauses)
-        else:
-            exchanges: list[Any] = [self.estimator.exchange(state) for state in states]
+        ledger, exchanges = self.estimator.ledger, cast(Any, _opened(self.estimator, states))
+        if isinstance(exchanges, list):
             commons = np.array([[exchange.common(clauses) for clauses in self._clauses] for exchange in exchanges])
+        else:
+            commons = exchanges.commons(self._clauses)
         # the union of what all know is never nothing
         return ledger.forwards(commons, int(ledger.steps[commons.max()]) + 1)
 
@@ -519,8 +530,8 @@ class Claimed:
             some = slice(first, first + size)
             by_factor = np.add.reduceat(self._of(values, some), self.view.starts, axis=2)
             found += np.tensordot(self.states[some], by_factor, axes=((0,), (1,)))
-        weighed = [self.bookkeeping.weighed(found[..., f], factor) for f, factor in enumerate(factors)]
-        return self.shared(np.sum(weighed, axis=0))
+        weighed = (self.bookkeeping.weighed(found[..., f], factor) for f, factor in enumerate(factors))
+        return self.shared(reduce(np.add, weighed))
 
     def shared(self, found: np.ndarray) -> np.ndarray:
         """What is known before the last exchange counts, (width, ...), after it: (groups, full width, ...)."""

@@ -99,17 +99,12 @@ class GraphLayer:
         common = [np.bitwise_and.reduce([masks[heard] for heard in clause]) for clause in clauses]
         return self._fuse(np.stack(common, axis=1))
 
-    def after(self, heard: np.ndarray) -> tuple[np.ndarray, list[GraphState]]:
-        """States before the next exchange, and which one follows on each state and outcome, (states, outcomes).
-
-        Parameters
-        ----------
-        heard : (outcomes, agents) whom each agent hears, as masks.
-        """
+    def after(self, heard: np.ndarray, missed: np.ndarray) -> tuple[np.ndarray, list[GraphState]]:
+        """Which state follows on each state and outcome, (states, outcomes), and these; see `AdditiveLayer`."""
         sets, index = np.unique(heard, return_inverse=True)
         index = index.reshape(heard.shape)
         masks = self._masks(sets.tolist())
-        values = _locals(self.estimator, self._fuse(masks), index)
+        values = _locals(self.estimator, self._fuse(masks), index, missed)
         of = np.repeat(np.arange(len(self.states)), len(heard))
         known = masks[:, index].reshape(-1, self.agents)
         which, states = _Merging(self, of, known, values).merged()
@@ -255,11 +250,11 @@ class NaiveLayer:
             out.append(self.estimator.ledger.combined(self.values[:, 0], of, terms, ones) if members[1:] else terms)
         return np.stack(out, axis=1)
 
-    def after(self, heard: np.ndarray) -> tuple[np.ndarray, list[NaiveState]]:
-        """States before the next exchange, and which one follows on each state and outcome; see `GraphLayer`."""
+    def after(self, heard: np.ndarray, missed: np.ndarray) -> tuple[np.ndarray, list[NaiveState]]:
+        """Which state follows on each state and outcome, (states, outcomes), and these; see `AdditiveLayer`."""
         ledger, permutations = self.estimator.ledger, np.array(self.estimator.relabellings)
         sets, index = np.unique(heard, return_inverse=True)
-        values = _locals(self.estimator, self.commons(sets[:, None].tolist()), index.reshape(heard.shape))
+        values = _locals(self.estimator, self.commons(sets[:, None].tolist()), index.reshape(heard.shape), missed)
         item, order = np.nonzero(_least(mixed(_invariants(ledger, values), 1), permutations))
         agents = np.take_along_axis(values[item], permutations[order], axis=1)
         agents = _moved(ledger, agents, order, permutations)
@@ -267,16 +262,20 @@ class NaiveLayer:
         return which.reshape(len(self.values), -1), [NaiveState(tuple(row)) for row in agents[first].tolist()]
 
 
-def _locals(estimator: FusionRule, unions: np.ndarray, index: np.ndarray) -> np.ndarray:
+def _locals(estimator: FusionRule, unions: np.ndarray, index: np.ndarray, missed: np.ndarray) -> np.ndarray:
     """Values of the agents' next local estimates, (states · outcomes, agents).
 
     Parameters
     ----------
     unions : (states, sets) what is fused.
     index : (outcomes, agents) number of the set that each agent hears.
+    missed : (outcomes,) agents whose sensors miss, as masks.
     """
-    local = {source: estimator.ledger.locals(unions, source) for source in set(estimator.sources)}
+    seen: list[int | None] = [*estimator.sources, *([None] if missed.any() else [])]
+    local = {source: estimator.ledger.locals(unions, source) for source in dict.fromkeys(seen)}
     values = [local[source][:, index[:, i]] for i, source in enumerate(estimator.sources)]
+    if missed.any():
+        values = [np.where(missed >> i & 1, local[None][:, index[:, i]], own) for i, own in enumerate(values)]
     return np.stack(values, axis=-1).reshape(-1, len(values))
 
 

@@ -129,10 +129,7 @@ class Ledger(Renamed):
     def measured(self, value: int, sources: Sequence[int]) -> int:
         """Return the value predicted to the next step, with the measurements of some sources there."""
         step = self.step[value] + 1
-        atoms = {self._atom(PRIOR, step, value): 1}
-        for source in sources:
-            atom = self._atom(MEASURED, step, source)
-            atoms[atom] = atoms.get(atom, 0) + 1
+        atoms = Counter([self._atom(PRIOR, step, value), *(self._atom(MEASURED, step, of) for of in sources)])
         return self._value(step, tuple(sorted(atoms.items())))
 
     def measurements(self, step: int, sources: Sequence[int]) -> int:
@@ -164,7 +161,7 @@ class Ledger(Renamed):
         values, times : of the terms.
         """
         step = self.steps[like]
-        brought = self._forwarded(values, step[of])
+        brought = self.forwards(values, step[of])
         starts = np.searchsorted(of, np.arange(len(like)))
         signed = times.view(np.uint64)[:, None] * self.signatures()[brought]
         which, first = numbered(np.ascontiguousarray(np.add.reduceat(signed, starts, axis=0).T))
@@ -205,20 +202,13 @@ class Ledger(Renamed):
 
         return mapped(values, known)
 
-    def forwards(self, values: np.ndarray, step: int) -> np.ndarray:
-        """Return many values brought forward, see `forward`; −1 stays."""
-        out = values.copy()
-        since = np.where(values < 0, step, self.steps[values])
-        for now in range(int(since.min(initial=step)), step):
-            out[since <= now] = self.locals(out[since <= now], None)
-        return out
-
-    def _forwarded(self, values: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        out = values.copy()
-        early = self.steps[values] < steps
-        for step in np.unique(steps[early]).tolist():
-            here = np.flatnonzero(early & (steps == step))
-            out[here] = self.forwards(values[here], step)
+    def forwards(self, values: np.ndarray, steps: np.ndarray | int) -> np.ndarray:
+        """Return many values brought forward, see `forward`, to a step or one each; −1 stays."""
+        out, last = values.copy(), int(np.max(steps, initial=0))
+        since = np.where(values < 0, last, self.steps[values])
+        for now in range(int(since.min(initial=last)), last):
+            here = (since <= now) & (now < steps)
+            out[here] = self.locals(out[here], None)
         return out
 
     @property

@@ -107,12 +107,13 @@ class AdditiveLayer(Protocol):
         """
         ...
 
-    def after(self, heard: np.ndarray) -> tuple[np.ndarray, list[Any]]:
+    def after(self, heard: np.ndarray, missed: np.ndarray) -> tuple[np.ndarray, list[Any]]:
         """Number of the state before the next exchange, (states, outcomes), and these states.
 
         Parameters
         ----------
         heard : (outcomes, agents) whom each agent hears, as masks.
+        missed : (outcomes,) agents whose sensors miss in between, as masks.
         """
         ...
 

@@ -59,7 +59,7 @@ KEPT = 8
 HELD = 1 << 24
 """Weights of claims that are held, and not found again when they are needed again."""
 CHUNK = 1 << 17
-"""Numbers of estimates that are worked on at a time."""
+"""Numbers of estimates that are worked on at a time: few enough to stay in the cache."""
 BLOCK = 1 << 20
 """Numbers that the values of a block of items take."""
 
