@@ -57,7 +57,7 @@ def predict(
     ] = "mean",
     agent: Annotated[
         str | None,
-        option("Whose: mean (the default), worst, best, a number or a name; or each.", SHOWN, metavar="N"),
+        option("Whose: mean (default), worst, best, a number, a name, each.", SHOWN, metavar="N"),
     ] = None,
     at: AtOption = None,
     normalise: Annotated[bool, option("Relative to link probability 0.", SHOWN + RARE, "--normalise")] = False,
