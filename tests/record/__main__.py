@@ -63,13 +63,16 @@ REFUSED_NOW = {
 """Calls that 0.1 answered wrongly, and why they are refused now."""
 GROWN = {"scenario list": "there are more presets", "scenario schema": "there are more keys"}
 """Calls whose answers hold more now."""
+BESIDE = {"estimated_error": "derivative"}
+"""Estimates of what rounding did, which are rounding themselves, and the numbers that they speak of."""
 
 
 def differences(a: Any, b: Any, where: str = "", scale: float = 0.0) -> list[tuple[str, float]]:
     """Where two answers differ, and by how much relative to the largest number beside it."""
     if isinstance(a, dict) and isinstance(b, dict):
         missing = [(f"{where}.{k} is gone", np.inf) for k in a if k not in b]
-        return missing + [d for k in a if k in b for d in differences(a[k], b[k], f"{where}.{k}")]
+        beside = {k: abs(a.get(of) or 0.0) for k, of in BESIDE.items()}
+        return missing + [d for k in a if k in b for d in differences(a[k], b[k], f"{where}.{k}", beside.get(k, 0.0))]
     if isinstance(a, list) and isinstance(b, list):
         if len(a) != len(b):
             return [(f"{where}: {len(a)} entries, now {len(b)}", np.inf)]
