@@ -92,8 +92,7 @@ class GraphTogether:
         if shared:
             self._known[:, self.agents] = 1
             keys = self._keys(self._known[:: self.agents], np.arange(runs))
-            order = np.argsort(keys)
-            places, _ = self._placed(np.zeros(runs, dtype=np.intp), keys[order], order)
+            places, _ = self._placed(np.zeros(runs, dtype=np.intp), keys, np.arange(runs))
             self._values[places] = packed(sources.starts[COMMON])
         self._step, self._schedule = 0, []
 
@@ -136,9 +135,8 @@ class GraphTogether:
             values = self._brought(different, step)[which]
             measured_too(values, self.sources, self.of, step, missed)
         keys = self._keys(rows, self._run)
-        order = np.argsort(keys)
-        places, _ = self._placed(np.full(len(keys), step), keys[order], self._run[order])
-        self._values[places] = values[order]
+        places, _ = self._placed(np.full(len(keys), step), keys, self._run)
+        self._values[places] = values
 
     def _hear(self) -> None:
         """Let everyone know what the nodes that arrive rest on."""
@@ -270,10 +268,11 @@ class GraphTogether:
         return (hashes(_words(rows), 1)[0] ^ (run.astype(np.uint64) * _RUN)) * _MIX
 
     def _placed(self, levels: np.ndarray, keys: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Places of the values of different sets of runs, by level and key in order; and which of them are new."""
+        """Places of the values of different sets, given by level, key and run; and which of them are new."""
         out, new = np.empty(len(keys), dtype=np.intp), []
         for level in np.flatnonzero(np.bincount(levels)).tolist():
             here = np.flatnonzero(levels == level)
+            here = here[np.argsort(keys[here])]
             if level not in self._found:
                 self._found[level] = np.zeros(0, dtype=np.uint64), np.zeros(0, dtype=np.intp)
             (known, places), keys_now = self._found[level], keys[here]

@@ -135,6 +135,20 @@ def test_what_would_not_fit_is_refused_with_the_number(monkeypatch):
         sf.predict(sf.load_scenario(agents=30, steps=3), [0.6], method="monte-carlo", runs=2)
 
 
+def test_a_set_that_was_met_is_not_gone_through_again(monkeypatch):
+    placed, met = pedigrees.GraphTogether._placed, []
+
+    def watched(self, levels, keys, run):
+        places, new = placed(self, levels, keys, run)
+        met.extend((id(self), int(levels[i]), int(keys[i])) for i in new)
+        return places, new
+
+    monkeypatch.setattr(pedigrees.GraphTogether, "_placed", watched)
+    drawn(scenario("unlike agents"), monkeypatch, few=2)
+    assert len(met) > 400
+    assert len(set(met)) == len(met)
+
+
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_hundreds_of_agents(estimator):
     """A chain in which everyone hears the one before: after step 1 two starts, whatever the rule makes of them."""
