@@ -3,8 +3,9 @@
 `python -m tests.benchmarks.kernel [--quick] [--sizes] [--most FILTERS]`.  Every way gets the noises in the layout that suits it, goes
 through five steps of predict and update, and returns the last covariances; answers must agree with the literal stacks.  JAX
 and Numba (extra `bench`) compile before they are timed, and so do our filters (extra `compiled`), at every size unless
-STOCHFUSE_COMPILED=0; what is not installed is named and left out.  Times are CPU time, the ways in turns, so that other work
-on the machine hits all alike; the lower quartile is shown.  What is small is done in a row, as it is where it matters.
+STOCHFUSE_COMPILED says otherwise; what is not installed is named and left out.  Times are CPU time, the ways in turns,
+so that other work on the machine hits all alike; the lower quartile is shown.  What is small is done in a row, as it is
+where it matters.
 """
 
 from __future__ import annotations
@@ -342,7 +343,8 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    if os.environ.get("OMP_NUM_THREADS") != "1":  # libraries read it when they are loaded: begin again
+    # libraries read it when they are loaded: begin again
+    if os.environ.get("OMP_NUM_THREADS") != "1" or SWITCH not in os.environ:
         flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
         os.execve(
             sys.executable,
