@@ -64,11 +64,14 @@ from stochfuse.estimators.progress import listener
 from stochfuse.kalman.algebra import NUMPY
 from stochfuse.kalman.kernel import (
     AsTheyAre,
+    Estimate,
     SquareRootNumbers,
     at_step,
     from_factor,
     posterior_gain,
+    predict,
     predict_factor,
+    taken_in,
     update_factor,
 )
 from stochfuse.scenario.model import Model, Sensor
@@ -159,7 +162,7 @@ def by_age(delay: Sequence[float], µ: np.ndarray, burst: np.ndarray | None, old
     ----------
     delay : probabilities of a delay of 0, 1, 2 … steps.
     """
-    in_time = np.array([sum(delay[: age + 1]) for age in range(oldest + 1)])
+    in_time = np.cumsum(delay)[np.minimum(range(oldest + 1), len(delay) - 1)]
     return µ[:, None] * in_time if burst is None else delivery_after_failures(burst, in_time)
 
 
@@ -446,10 +449,11 @@ class LosslessFilter(NamedTuple):
         sensors = [(given.rounded(at_step(s.H, step)), given.noise(at_step(s.R, step))) for s in self.sensors]
         arrived = [(H, R, n) for kind, (H, R) in enumerate(sensors) if (n := counts[..., kind]).any()]
         if self.scalar:
-            x, P = None if before.x is None else F * before.x, F * before.root * F + Q
+            x, P = predict(Estimate(*before), F, Q)
             # all that measurements of a scalar say, whatever their size
-            gained = 1.0 + P * sum(n[..., None, None] * (H.T @ NUMPY.solve(R, H)) for H, R, n in arrived)
-            return AlongPath(None if x is None else x / gained, P / gained)
+            J = sum(n * (H.T @ NUMPY.solve(R, H))[..., 0, 0] for H, R, n in arrived)
+            P, x = taken_in(P[None, None, ..., 0, 0], J, None if x is None else x[None, ..., 0, 0])
+            return AlongPath(None if x is None else x[0, ..., None, None], P[0, 0, ..., None, None])
         x, L = before.x, given.rounded(predict_factor(given.rounded(before.root), F, given.factor(Q)))
         x = x if x is None else F @ x
         for H, R, n in arrived:
