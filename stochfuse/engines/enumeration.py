@@ -32,7 +32,7 @@ import numpy as np
 
 from stochfuse.engines.events import ChanceEvent, Outcome, Rows, Weights, concerning, number_of_outcomes, outcomes
 from stochfuse.errors import TooManyError
-from stochfuse.estimators.ledger import different, numbered
+from stochfuse.estimators.ledger import different, hashes, numbered
 from stochfuse.estimators.progress import listener, uncollected
 from stochfuse.estimators.protocol import AdditiveEstimator, AdditiveLayer, Estimator, Exchange
 from stochfuse.scenario.system import Detection
@@ -393,8 +393,7 @@ def _two_step_ending(
 
 def _rows_once(ids: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """States of which everything is equal that is still asked for as one, with their weights added up."""
-    random = np.random.default_rng(3).integers(1 << 64, size=(2, ids.shape[1]), dtype=np.uint64)
-    which, one = numbered(random @ ids.T.view(np.uint64))
+    which, one = numbered(hashes(ids))
     total = np.zeros((len(one), weights.shape[1]))
     np.add.at(total, which, weights)
     return ids[one], total

@@ -129,12 +129,16 @@ class Ledger(Renamed):
     def measured(self, value: int, sources: Sequence[int]) -> int:
         """Return the value predicted to the next step, with the measurements of some sources there."""
         step = self.step[value] + 1
-        atoms = Counter([self._atom(PRIOR, step, value), *(self._atom(MEASURED, step, of) for of in sources)])
-        return self._value(step, tuple(sorted(atoms.items())))
+        return self._counted(step, [(PRIOR, value), *((MEASURED, of) for of in sources)])
 
     def measurements(self, step: int, sources: Sequence[int]) -> int:
         """Information of some sources' measurements at a step, and nothing else."""
-        return self._value(step, tuple(sorted(Counter(self._atom(MEASURED, step, of) for of in sources).items())))
+        return self._counted(step, [(MEASURED, of) for of in sources])
+
+    def _counted(self, step: int, kinds: Iterable[tuple[str, int]]) -> int:
+        """Return the sum of some atoms of a step, given by kind and what they are of, as often as each stands there."""
+        atoms = Counter(self._atom(kind, step, of) for kind, of in kinds)
+        return self._value(step, tuple(sorted(atoms.items())))
 
     def forward(self, value: int, step: int) -> int:
         """Return the value brought forward to a later step by the time update (24)."""
