@@ -451,7 +451,7 @@ class LosslessFilter(NamedTuple):
         if self.scalar:
             x, P = predict(Estimate(*before), F, Q)
             # all that measurements of a scalar say, whatever their size
-            J = sum(n * (H.T @ NUMPY.solve(R, H))[..., 0, 0] for H, R, n in arrived)
+            J = sum((n * (H.T @ NUMPY.solve(R, H))[..., 0, 0] for H, R, n in arrived), np.zeros(()))
             P, x = taken_in(P[None, None, ..., 0, 0], J, None if x is None else x[None, ..., 0, 0])
             return AlongPath(None if x is None else x[0, ..., None, None], P[0, 0, ..., None, None])
         x, L = before.x, given.rounded(predict_factor(given.rounded(before.root), F, given.factor(Q)))
